@@ -14,15 +14,7 @@ from splinecli.calibration.view import View, find_view, unit_rays
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
-from splinecli.capture.layouts.capture_files import (
-    FILENAMES,
-    MASK,
-    NOT_PHOTOGRAPHS,
-    check_not_empty,
-    find_named,
-    list_images,
-    read_image_list,
-)
+from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -79,19 +71,9 @@ class CalibratedLights:
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
     """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
 
-    Args:
-        mask: a mask that replaces the one in the folder.
-
-    Raises:
-        InputError: the folder does not exist, cannot be read, or has no images.
+    A mask that is given replaces the one in the folder. Raises InputError where there are no images.
     """
-    filenames = find_named(folder, [FILENAMES])
-    images = (
-        read_image_list(filenames)
-        if filenames is not None
-        else list_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
-    )
-    check_not_empty(images, folder)
+    images, _ = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
     others = list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
     return BallFiles(folder, images, reference, mask or find_named(folder, MASK))
@@ -128,11 +110,8 @@ def calibrate_ball(
         if not circle.inside(shape).any():
             raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
-            highlight = find_highlight(
-                to_linear(stored, path).mean(axis=2),
-                circle,
-                full_scale=1.0 if stored.dtype.kind == "u" else None,
-            )
+            full_scale = 1.0 if stored.dtype.kind == "u" else None
+            highlight = find_highlight(to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale)
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
             check_in_front(direction[0], unit_rays(point, view.matrix)[0])

@@ -27,19 +27,13 @@ _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show 
 
 @dataclass(frozen=True)
 class RadiometricCalibration:
-    """How stored values become linear light.
+    """How stored values become linear light."""
 
-    Args:
-        curve: the images' transfer curve.
-        automatic: whether the curve that all images state is used in its place.
-        ambient: an image under ambient light alone, which is subtracted from all others.
-        flat_field: images of an evenly white surface, one for each light or one for all. Images are divided by them.
-    """
-
-    curve: TransferCurve = 1.0
-    ambient: Path | None = None
+    curve: TransferCurve = 1.0  # the images' transfer curve
+    ambient: Path | None = None  # an image under ambient light alone, which is subtracted from all others
+    # images of an evenly white surface, one for each light or one for all. Images are divided by them
     flat_field: tuple[Path, ...] = ()
-    automatic: bool = False
+    automatic: bool = False  # whether the curve that all images state is used in place of `curve`
 
     def with_stated_curve(self, images: Sequence[ImageFacts]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
@@ -95,11 +89,7 @@ class PixelReader:
     """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
 
     def __init__(
-        self,
-        radiometry: RadiometricCalibration,
-        mask: NDArray[np.bool_],
-        n_images: int,
-        window: Window = WHOLE,
+        self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int, window: Window = WHOLE
     ) -> None:
         """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
         self.radiometry = radiometry

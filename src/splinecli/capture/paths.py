@@ -3,6 +3,8 @@
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from splinecli.errors import InputError
@@ -41,6 +43,15 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
         raise InputError("the file does not exist", path=path)
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
         raise InputError(f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path)
+
+
+@contextmanager
+def reading(path: Path, what: str = "file") -> Iterator[None]:
+    """Turn an error of the system while a file is read into an InputError that names it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"the {what} cannot be read ({error.strerror})", path=path) from None
 
 
 def is_found_file(path: Path) -> bool:

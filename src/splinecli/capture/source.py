@@ -42,38 +42,24 @@ Progress = Callable[[], object]  # called once after each image
 
 @dataclass(frozen=True, eq=False)
 class CaptureSource:
-    """An opened capture: lights and facts of images loaded, pixels still on disk.
-
-    Args:
-        light_directions: (F, 3) float64, unit; x right, y up, z to the camera. They mean nothing
-            where find_lights is given.
-        light_intensities: (F, 3) float64, RGB; ones where no file gives them.
-        intensities_known: whether a file or the user gives the intensities.
-        intensities_measured: whether a file gives the intensities.
-        white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
-        light_frame: the frame of the light file, in which the directions are no longer.
-        automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
-        lamps: what is known of near lamps, or None.
-        window: the part of the images that is read. All masks but those in files have its size.
-        find_lights: finds the lights from the images; None where files give them.
-        stamp: JSON values that change when a file that is read for the capture, or the given white level, does. They
-            are older than what was read: a file that changed meanwhile has another stamp the next time.
-    """
+    """An opened capture: lights and facts of images loaded, pixels still on disk."""
 
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
-    light_directions: NDArray[np.float64]
-    light_intensities: NDArray[np.float64]
+    light_directions: NDArray[np.float64]  # (F, 3), unit; x right, y up, z to the camera. See find_lights
+    light_intensities: NDArray[np.float64]  # (F, 3), RGB; ones where no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
-    white_level: float | None = None
-    automatic_mask: NDArray[np.bool_] | None = None
-    intensities_known: bool = True
-    intensities_measured: bool = True
-    light_frame: LightFrame = USUAL_FRAME
-    lamps: LampFiles | None = None
-    window: Window = WHOLE
-    find_lights: LightFinder | None = None
+    white_level: float | None = None  # stored value from which an observation counts as saturated; None to find it
+    automatic_mask: NDArray[np.bool_] | None = None  # (H, W), made from the images in place of a file; see find_mask
+    intensities_known: bool = True  # whether a file or the user gives the intensities
+    intensities_measured: bool = True  # whether a file gives the intensities
+    light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
+    lamps: LampFiles | None = None  # what is known of near lamps, or None
+    window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
+    find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
+    # JSON values that change when a file that is read for the capture, or the given white level, does. They are older
+    # than what was read: a file that changed meanwhile has another stamp the next time
     stamp: tuple[Any, ...] = ()
 
     @property
@@ -81,11 +67,7 @@ class CaptureSource:
         return len(self.light_directions)
 
     def read(
-        self,
-        light_indices: Sequence[int] | None = None,
-        progress: Progress | None = None,
-        *,
-        as_stored: bool = False,
+        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None, *, as_stored: bool = False
     ) -> Capture:
         """Return the capture under the chosen lights (None for all), in the order given.
 
@@ -115,10 +97,7 @@ class CaptureSource:
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
-            whole = self.window.whole(mask)
-            ground_truth, upside_down = read_ground_truth(
-                self.files.ground_truth, (whole.shape[0], whole.shape[1]), whole
-            )
+            ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
         images = self.read_pixels(mask, indices, lambda pixels: pixels)
         observations, saturation, warnings = collect_observations(

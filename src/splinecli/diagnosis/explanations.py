@@ -13,7 +13,7 @@ from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_rows, shade
+from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_values, shade
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import rough_normals
 from splinecli.maths.normals import angle_between_deg, unit
@@ -150,20 +150,17 @@ def _choose(observations: NDArray[np.floating]) -> tuple[NDArray[np.intp], Array
     none = np.zeros(0, np.intp), np.zeros((0, n_lights))
     if n_lights < MIN_LIGHTS or len(observations) < _MIN_PIXELS:
         return none
-    chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
-    values = observations[chosen].astype(np.float64).clip(min=0)
-    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    chosen, values = lit_values(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+    values = values.clip(min=0)
     # Three unknowns need more than three lit observations to leave a residual.
     enough = (values > _SHADOW_SHARE).sum(axis=1) >= 5
     return (chosen[enough], values[enough]) if enough.sum() >= _MIN_PIXELS else none
 
 
 def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float = _SHADOW_SHARE) -> Array:
-    """Return mean and median |difference| of lit values (p, F) from a robust fit of I^gamma = l . b.
+    """Return mean and median |difference| of lit values (p, F), above `shadow`, from a robust fit of I^gamma = l . b.
 
-    Args:
-        lights: (F, 3) or (p, F, 3), of any length.
-        shadow: values up to this do not count.
+    The lights (F, 3) or (p, F, 3) have any length.
     """
     lit = values > shadow
     # The slope of the stored value over the linear one, so that both readings have the same errors.

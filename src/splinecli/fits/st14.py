@@ -85,36 +85,26 @@ def coefficient_count(kept: Tensor) -> Tensor:
 
 
 class _Problem(NamedTuple):
-    """The kept observations of a batch of pixels, at most K each, and the prior.
+    """The kept observations of a batch of pixels, at most K each, and the prior."""
 
-    intensities: (P, K), the largest of a pixel 1. lights, bisectors: (P, K, 3). light_powers: (P, K, 3), powers of 1 -
-    l.h. precision: (9,), of the prior. ridge: (P, 9), which removes coefficients from the model. facing: (P, F + 1, 3),
-    the directions that the normal has to face.
-    """
-
-    intensities: Tensor
-    lights: Tensor
-    bisectors: Tensor
-    light_powers: Tensor
-    precision: Tensor
-    ridge: Tensor
-    facing: Tensor
+    intensities: Tensor  # (P, K), the largest of a pixel 1
+    lights: Tensor  # (P, K, 3)
+    bisectors: Tensor  # (P, K, 3)
+    light_powers: Tensor  # (P, K, 3), powers of 1 - l.h
+    precision: Tensor  # (9,), of the prior
+    ridge: Tensor  # (P, 9), which removes coefficients from the model
+    facing: Tensor  # (P, F + 1, 3), the directions that the normal has to face
 
 
 class _Fit(NamedTuple):
-    """The best reflectance for given normals, and the derivatives of its cost.
+    """The best reflectance for given normals, and the derivatives of its cost."""
 
-    normals: (P, 3). cost: (P,). noise: (P,), the variance estimated from the residual. tangents: (P, 3, 2), the
-    directions in which the normal can move. gradient, curvature: (P, 2) and (P, 2, 2), half the derivatives of the cost
-    along the tangents.
-    """
-
-    normals: Tensor
-    cost: Tensor
-    noise: Tensor
-    tangents: Tensor
-    gradient: Tensor
-    curvature: Tensor
+    normals: Tensor  # (P, 3)
+    cost: Tensor  # (P,)
+    noise: Tensor  # (P,), the variance estimated from the residual
+    tangents: Tensor  # (P, 3, 2), the directions in which the normal can move
+    gradient: Tensor  # (P, 2), half the first derivative of the cost along the tangents
+    curvature: Tensor  # (P, 2, 2), half the second derivative
 
     def step(self, damping: Tensor) -> Tensor:
         """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean curvature."""

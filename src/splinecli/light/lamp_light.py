@@ -39,19 +39,12 @@ def flat_depth(lamps: NearLamps) -> float:
 
 @dataclass(frozen=True)
 class LampLight:
-    """Observations as distant lamps would give them, with the light directions of each pixel.
+    """Observations as distant lamps would give them, with the light directions of each pixel."""
 
-    Args:
-        observations: (P, F), without the falloff of the lamps.
-        directions: unit; (P, F, 3) in each pixel's own frame, whose z axis points from the surface to the camera, or
-            (F, 3) for distant lights.
-        turns: (P, 3, 3), from the capture's frame to the pixels' own. None for an orthographic camera, where all are
-            one frame.
-    """
-
-    observations: NDArray[np.float32]
+    observations: NDArray[np.float32]  # (P, F), without the falloff of the lamps
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights
     directions: NDArray[np.floating]
-    turns: NDArray[np.float32] | None = None
+    turns: NDArray[np.float32] | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
 
     @classmethod
     def of(cls, observations: NDArray[np.float32], lamps: NearLamps) -> LampLight:

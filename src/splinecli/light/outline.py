@@ -31,15 +31,10 @@ _ROUNDS, _CONVERGED = 25, 1e-4
 
 
 class OutlineTurn(NamedTuple):
-    """A rotation that turns the normals at the outline outwards.
+    """A rotation that turns the normals at the outline outwards."""
 
-    Attributes:
-        rotation: (3,), the rotation vector of lights and normals.
-        spread: the median of what remains of the z of these normals. It is small where the outline is one of a smooth
-            surface that the fit explains.
-    """
-
-    rotation: Array
+    rotation: Array  # (3,), the rotation vector of lights and normals
+    # the median of what remains of the z of these normals; small where the outline is that of a smooth surface
     spread: float
 
     def share(self, part: float) -> Array:

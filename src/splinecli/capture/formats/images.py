@@ -173,8 +173,7 @@ def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[n
 def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     """Return stored values of any shape as float32 on the scale of read_image.
 
-    Raises:
-        InputError: a floating-point value is negative or not finite.
+    Raises InputError for a floating-point value that is negative or not finite.
     """
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused below
         values = stored.astype(np.float32)
@@ -210,13 +209,9 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np
         return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
     if largest <= 0:
-        raise InputError(
-            "the mask is empty: every pixel is zero",
-            path=path,
-            hint="Paint the object white, or give no mask",
-        )
-    mask: NDArray[np.bool_] = (stored > stored.max() / 2).any(axis=2)
-    return mask
+        hint = "Paint the object white, or give no mask"
+        raise InputError("the mask is empty: every pixel is zero", path=path, hint=hint)
+    return np.asarray((stored > stored.max() / 2).any(axis=2))
 
 
 def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
@@ -224,7 +219,5 @@ def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
 
     Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
     """
-    if alpha is None:
-        return None
-    opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
-    return opaque if opaque.any() and not opaque.all() else None
+    opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)
+    return opaque if opaque is not None and opaque.any() and not opaque.all() else None

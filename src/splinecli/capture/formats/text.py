@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import JPEG, PNG, TIFF
-from splinecli.capture.paths import check_file, is_substitution
+from splinecli.capture.paths import check_file, is_substitution, reading
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -51,12 +51,9 @@ class NumberRows:
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
         for (_, line, text), length in zip(self.rows, lengths, strict=True):
             if length != usual:
-                raise InputError(
-                    f"found {columns(length)}, expected {usual} as in the other lines",
-                    path=self.path,
-                    line=line,
-                    hint=DECIMAL_POINT if length > usual and has_decimal_commas(text) else None,
-                )
+                hint = DECIMAL_POINT if length > usual and has_decimal_commas(text) else None
+                problem = f"found {columns(length)}, expected {usual} as in the other lines"
+                raise InputError(problem, path=self.path, line=line, hint=hint)
         return np.array([row.numbers for row in self.rows], np.float64)
 
 
@@ -91,7 +88,7 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
         InputError: the file is missing, no file, or has more than `most` bytes.
     """
     check_file(path, expected, pipe=True)
-    try:
+    with reading(path):
         if not is_substitution(path):
             check_length(path, most)
             return path.read_bytes()
@@ -102,8 +99,6 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
                 raise _too_long(f"more than {most / 1e6:.1f} MB", most, path)
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
 
 
 def read_lines(
@@ -157,11 +152,7 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
 
 
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
-    """Return the numbers of rows of words.
-
-    Raises:
-        InputError: with the line, for a word that is no finite number; also where there are no rows.
-    """
+    """Return the numbers of rows of words. Raises InputError with the line for other words, and for no rows."""
     if not rows:
         raise InputError("the file contains no numbers", path=path)
     parsed = (Row(tuple(parse_number(word, path, line) for word in words), line, text) for line, text, words in rows)

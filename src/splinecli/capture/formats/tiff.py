@@ -102,16 +102,12 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 
 
 def _check_complete(page: Any, size: int, path: Path) -> None:
-    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels.
-
-    A compressed part that is longer than its pixels would be may expand to a thousand times their size. So may a tile
-    that is far larger than the picture.
-    """
+    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels."""
+    # Such a part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture.
     expanded = math.prod(page.chunks) * page.dtype.itemsize
     longest = 2 * expanded + _LONGEST_EMPTY_PART
     if expanded > 2 * page.nbytes + _LARGEST_EMPTY_PART or max(page.databytecounts, default=0) > longest:
         raise ValueError
-    if any(
-        count == 0 or offset + count > size for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
-    ):
+    parts = zip(page.dataoffsets, page.databytecounts, strict=True)
+    if any(count == 0 or offset + count > size for offset, count in parts):
         raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)

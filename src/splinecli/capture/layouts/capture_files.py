@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
-from splinecli.capture.paths import check_file, find_mode, is_found_file, resolve
+from splinecli.capture.paths import check_file, find_mode, is_found_file, reading, resolve
 from splinecli.errors import InputError
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
@@ -27,10 +27,8 @@ class NoImagesError(InputError):
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
-    parts: list[int | str] = [
-        int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(path.name.casefold()))
-    ]
-    return parts, path.name
+    parts = enumerate(_DIGITS.split(path.name.casefold()))
+    return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
 def list_folder(folder: Path) -> list[Path]:
@@ -44,11 +42,8 @@ def list_folder(folder: Path) -> list[Path]:
         raise InputError("the folder does not exist", path=folder)
     if not stat.S_ISDIR(mode):
         raise InputError("found a file, expected a folder of images", path=folder)
-    try:
-        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    except OSError as error:
-        raise InputError(f"the folder cannot be read ({error.strerror})", path=folder) from None
-    return sorted(entries, key=natural_key)
+    with reading(folder, "folder"):
+        return sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key)
 
 
 def list_images(
@@ -116,6 +111,18 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
     return tuple(images)
 
 
+def find_images(
+    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
+) -> tuple[tuple[Path, ...], bool]:
+    """Return the images of a folder, and whether filenames.txt names them; see list_images. Raises NoImagesError."""
+    filenames = find_named(folder, [FILENAMES])
+    if filenames is not None:
+        return read_image_list(filenames), True
+    images = list_images(folder, leave_out_stems=leave_out_stems, leave_out=leave_out)
+    check_not_empty(images, folder)
+    return images, False
+
+
 FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
 _NAMED_LIGHTS = (".lp", "lights.json")  # endings of the names of light files that name the image of each light
@@ -143,33 +150,20 @@ NOT_PHOTOGRAPHS = frozenset({Path(name).stem for name in (*MASK, *AMBIENT, *GROU
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """The files of one capture, with the images in the order of the lights.
+    """The files of one capture, with the images in the order of the lights."""
 
-    Args:
-        layout: name of the arrangement of files, for people.
-        name: name of the capture, in most layouts that of its folder.
-        folder: the folder with the files beside the images.
-        light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no
-            lights are needed.
-        light_intensities: F x 3 text, or None where no file gives them.
-        mask: an image, or None where every pixel counts.
-        boundaries: used instead of a mask: images whose pixels above zero together are the object.
-        ground_truth: a normal map, or None.
-        ambient: an image under none of the lights, or None.
-        others: pictures beside the images whose names say that they are no photographs.
-    """
-
-    layout: str
-    name: str
-    folder: Path
+    layout: str  # name of the arrangement of files, for people
+    name: str  # name of the capture, in most layouts that of its folder
+    folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
+    # F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no lights are needed
     light_directions: Path | None
-    light_intensities: Path | None = None
-    mask: Path | None = None
-    ground_truth: Path | None = None
-    boundaries: tuple[Path, ...] = ()
-    ambient: Path | None = None
-    others: tuple[Path, ...] = ()
+    light_intensities: Path | None = None  # F x 3 text, or None where no file gives them
+    mask: Path | None = None  # an image, or None where every pixel counts
+    ground_truth: Path | None = None  # a normal map, or None
+    boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
+    ambient: Path | None = None  # an image under none of the lights, or None
+    others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
 
 
 @dataclass(frozen=True)
@@ -196,30 +190,6 @@ class Overrides:
 NO_OVERRIDES = Overrides()
 
 
-def gather_files(
-    layout: str,
-    folder: Path,
-    images: tuple[Path, ...],
-    lights: Path | None,
-    overrides: Overrides,
-    *,
-    ground_truth_names: Sequence[str] = GROUND_TRUTH,
-    others: tuple[Path, ...] = (),
-) -> CaptureFiles:
-    """Return the images and lights with the other files of the folder. Files named by the user replace those."""
-    return CaptureFiles(
-        layout=layout,
-        name=folder_name(folder),
-        folder=folder,
-        images=images,
-        light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
-        ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),
-        others=others,
-    )
-
-
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
@@ -242,10 +212,6 @@ def find_lights(folder: Path) -> Path | None:
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
-
-    Raises:
-        InputError: the system refuses to resolve a path with "..".
-    """
+    """Return the folder's own name, also for ".", "..", and a trailing slash; a link keeps its. Raises InputError."""
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"

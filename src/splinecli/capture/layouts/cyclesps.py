@@ -36,9 +36,7 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
-    Raises:
-        InputError: the object has no folder of images or several; or no light.txt or no boundary masks, and none are
-            named instead; or its images do not match its lights.
+    Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
     """
     captures = list_captures(folder)
     if captures is None:
@@ -63,11 +61,11 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
             hint="Pass --lights FILE, with one line x y z for each image",
         )
     return CaptureFiles(
-        layout="CyclesPS",
-        name=_name(images_folder),
-        folder=holder,
-        images=_list_numbered(images_folder, len(read_light_directions(lights)), lights),
-        light_directions=lights,
+        "CyclesPS",
+        _name(images_folder),
+        holder,
+        _list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        lights,
         light_intensities=overrides.intensities,
         mask=overrides.mask,
         boundaries=() if overrides.mask else _find_boundaries(holder),

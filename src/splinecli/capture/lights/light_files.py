@@ -90,23 +90,18 @@ def lights_of(
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     places = [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))]
-    return vectors, unit_directions(vectors, table.path, lines, places, of_lamps=form == "positions")
+    return vectors, unit_directions(vectors, table.path, lines, places, lamps=form == "positions")
 
 
 def unit_directions(
-    vectors: NDArray[np.float64],
-    path: Path,
-    lines: Sequence[int | None],
-    places: Sequence[str],
-    *,
-    of_lamps: bool = False,
+    vectors: NDArray[np.float64], path: Path, lines: Sequence[int | None], places: Sequence[str], lamps: bool = False
 ) -> NDArray[np.float64]:
     """Return vectors (F, 3) at unit length.
 
     Args:
         vectors: of any length.
         places: words for the place of each vector on its line.
-        of_lamps: whether the vectors are positions of lamps, for messages.
+        lamps: whether the vectors are positions of lamps, for messages.
 
     Raises:
         InputError: a zero vector, or a light that is not above the horizon.
@@ -119,14 +114,14 @@ def unit_directions(
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             raise InputError(
-                f"found a zero vector{place}, expected a {'lamp position' if of_lamps else 'light direction'}",
+                f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}",
                 path=path,
                 line=line,
                 hint="Write x y z towards the light, or remove the line and its image",
             )
         if z <= 0:
             raise InputError(
-                f"found a {'lamp behind the object' if of_lamps else 'light below the horizon'}{place}"
+                f"found a {'lamp behind the object' if lamps else 'light below the horizon'}{place}"
                 f" (z = {vector[2]:g}), expected z > 0",
                 path=path,
                 line=line,
@@ -163,11 +158,9 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
     """Return the table in the order of a first column that counts the lights, and without that column."""
     rows = table.rows
-    if {len(row.numbers) for row in rows} != {n_columns + 1} or n_images not in (None, len(rows)):
-        return table
-    if n_images is None and len(rows) == n_columns:
-        return table  # one light in each column
-    if counts_rows([row.numbers[0] for row in rows]) is None:
+    fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
+    in_columns = n_images is None and len(rows) == n_columns  # one light in each
+    if not fits or in_columns or counts_rows([row.numbers[0] for row in rows]) is None:
         return table
     ordered = sorted(rows, key=lambda row: row.numbers[0])
     return replace(table, rows=tuple(row._replace(numbers=row.numbers[1:]) for row in ordered))
@@ -200,8 +193,7 @@ def _one_light_a_row(
 ) -> tuple[NDArray[np.float64], bool]:
     """Return the numbers with one light in each row, and whether the file has one light in each column.
 
-    Args:
-        names: the possible counts of numbers for a light, each with its meaning.
+    `names` has the possible counts of numbers for a light, each with its meaning.
     """
     values = table.as_array()
     n_columns = values.shape[1]

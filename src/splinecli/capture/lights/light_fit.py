@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_rows
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
 
 Array = NDArray[np.float64]
 
@@ -163,9 +163,7 @@ def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
     for share in DARK_SHARES:
-        chosen = lit_rows(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
-        values = observations[chosen].astype(np.float64)
-        values = values / values.max(axis=1, keepdims=True)
+        _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
         kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import NumberRows, parse_rows, read_rows_of_words, to_number
+from splinecli.capture.formats.text import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
@@ -161,15 +161,12 @@ def _order_of(header: list[str]) -> list[int]:
 def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
     """Return rows whose last numbers are in the order given."""
     first = -len(order)
-    if order == sorted(order):
-        return table
-    rows = (
-        row._replace(numbers=(*row.numbers[:first], *(row.numbers[first:][i] for i in order)))
-        if len(row.numbers) >= len(order)
-        else row
-        for row in table.rows
-    )
-    return replace(table, rows=tuple(rows))
+
+    def reorder(row: Row) -> Row:
+        last = row.numbers[first:]
+        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order))) if len(last) == -first else row
+
+    return replace(table, rows=tuple(map(reorder, table.rows)))
 
 
 def image_name(text: str, numbers: list[str]) -> str:

@@ -122,10 +122,7 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
 
 
 def _read_json(path: Path, frame: LightFrame) -> NamedLights:
-    """Read AliceVision's format.
-
-    {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
-    """
+    """Read AliceVision's lights: objects with viewId, type (directional), direction [x, y, z], intensity [r, g, b]."""
     try:
         document = parse_json("\n".join(read_lines(path)))
     except json.JSONDecodeError as error:
@@ -150,31 +147,24 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
         vectors.append(_three_numbers(light, "direction", number, path))
         if "intensity" in light:
             intensities.append(_three_numbers(light, "intensity", number, path))
-            if min(intensities[-1]) <= 0:
-                raise InputError(
-                    f"light {number} has the intensity {min(intensities[-1]):g}, expected above 0", path=path
-                )
+            if (least := min(intensities[-1])) <= 0:
+                raise InputError(f"light {number} has the intensity {least:g}, expected above 0", path=path)
     if intensities and len(intensities) != len(lights):
-        raise InputError(
-            f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none", path=path
-        )
-    directions = unit_directions(
-        np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0,  # no -0
-        path,
-        [None] * len(lights),
-        [f" as light {number}" for number in range(1, len(lights) + 1)],
-    )
-    return NamedLights(
-        path, tuple(names), (None,) * len(names), directions, np.array(intensities) if intensities else None
-    )
+        problem = f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none"
+        raise InputError(problem, path=path)
+    turned = np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0  # no -0
+    lines, places = (None,) * len(lights), [f" as light {number}" for number in range(1, len(lights) + 1)]
+    directions = unit_directions(turned, path, lines, places)
+    return NamedLights(path, tuple(names), lines, directions, np.array(intensities) if intensities else None)
 
 
 def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
     values = light.get(key)
-    good = isinstance(values, list) and len(values) == 3
-    if not good or not all(
-        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-        for value in values or ()
-    ):
+    numbers = [
+        float(value)
+        for value in (values if isinstance(values, list) else ())
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    ]
+    if len(numbers) != 3 or len(values or ()) != 3:
         raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
-    return [float(value) for value in values or ()]
+    return numbers

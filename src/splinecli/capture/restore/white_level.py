@@ -47,15 +47,10 @@ def check_white_level(value: float | None) -> None:
 
 @dataclass(frozen=True)
 class WhiteLevel:
-    """The stored value from which observations count as saturated.
+    """The stored value from which observations count as saturated."""
 
-    Args:
-        value: in the unit of the files, such as 4095.
-        origin: "given" by the user, stated in the "file", seen in the "images", or the "full scale" of the files.
-    """
-
-    value: float
-    origin: Origin
+    value: float  # in the unit of the files, such as 4095
+    origin: Origin  # given by the user, stated in the file, seen in the images, or the full scale of the files
 
 
 _NOTHING = np.empty(0, np.int64)
