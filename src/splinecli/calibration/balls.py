@@ -64,8 +64,7 @@ class CalibratedLights:
 
     balls: tuple[BallCalibration, ...]
     directions: NDArray[np.float64]  # (F, 3) float64, unit vectors: the mean direction of the balls
-    # (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a single ball
-    disagreement_deg: NDArray[np.float64]
+    disagreement_deg: NDArray[np.float64]  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
@@ -128,17 +127,11 @@ def calibrate_ball(
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls.
-
-    Raises:
-        InputError: the balls have different numbers of images.
-    """
-    counts = [len(ball.directions) for ball in balls]
-    if len(set(counts)) > 1:
-        raise InputError(
-            "the balls have " + ", ".join(f"{n} images ({b.files.folder})" for n, b in zip(counts, balls, strict=True)),
-            hint="Every ball needs one image for each light, in the same order",
-        )
+    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers of images."""
+    if len({len(ball.directions) for ball in balls}) > 1:
+        counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)
+        hint = "Every ball needs one image for each light, in the same order"
+        raise InputError(f"the balls have {counts}", hint=hint)
     stacked = np.stack([ball.directions for ball in balls])
     directions = unit(stacked.sum(axis=0))
     disagreement = np.stack([angle_between_deg(own, directions) for own in stacked]).max(axis=0)

@@ -96,10 +96,8 @@ class PixelReader:
         self.mask, self._window = mask, window
         flats = radiometry.flat_field
         if len(flats) not in (0, 1, n_images):
-            raise InputError(
-                f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image",
-                path=flats[0].parent,
-            )
+            problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+            raise InputError(problem, path=flats[0].parent)
         self._ambient: NDArray[np.float32] | None = None
         if radiometry.ambient is not None:
             self._ambient = self._read(radiometry.ambient, "the other images")[1]
@@ -108,8 +106,7 @@ class PixelReader:
     def read(self, path: Path, index: int, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
         """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
 
-        Args:
-            like: the image of the expected size, for messages.
+        Messages name `like` as the image of the expected size.
         """
         stored, linear = self._read(path, like)
         if len(self.radiometry.flat_field) > 1:
@@ -175,13 +172,8 @@ def collect_observations(
 ) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
     """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
 
-    Only one image is in memory at a time.
-
-    Args:
-        white_level: the one that the user gave; None to find it.
-
-    Raises:
-        InputError: the white level that the user gave is above an image's full scale.
+    Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
+    it is above an image's full scale.
     """
     observations = np.empty((n_pixels, n_images), np.float32)
     any_8_bit, found = False, []

@@ -158,11 +158,9 @@ class CaptureSource:
             mask = read_mask(files.mask, expected)
         mask = self.window.of(mask)
         if not mask.any():
-            raise InputError(
-                "the mask has no pixel in the part that is read",
-                path=files.mask or files.folder,
-                hint="Choose another --crop, or a larger --scale",
-            )
+            problem = "the mask has no pixel in the part that is read"
+            hint = "Choose another --crop, or a larger --scale"
+            raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:

@@ -83,11 +83,9 @@ def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
 def check_ground_truth(
     sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating] | None
 ) -> list[CaptureWarning]:
-    """Return a warning if a ground truth (H, W, 3) fits a sample only in another frame, or an empty list.
+    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame.
 
-    Args:
-        light_directions: (F, 3).
-        truth: of the whole images; unit normals, or zero where there is no ground truth. None gives no warning.
+    It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
     """
     if truth is None:
         return []
@@ -125,10 +123,9 @@ def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float
         return None
     rows, columns = (places[chosen] for places in np.nonzero(sample.mask))
     width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
-    shape = (sample.mask.shape[0], sample.mask.shape[1])
     ratios, lights = [], []
     for widths in DISTANCES:
-        lamps = NearLamps.of(light_directions * widths * width, 1.0, shape, equal=True)
+        lamps = NearLamps.of(light_directions * widths * width, 1.0, sample.mask.shape, equal=True)
         directions, strengths = lamps.light_at(lamps.plane_points(rows, columns))
         lights.append(np.asarray(directions * strengths[..., None], np.float64))
         ratios.append(float(np.sqrt(np.prod(_misfits(values, lights[-1]) / before))))

@@ -47,9 +47,7 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows; None where it shows none.
-
-    The border of the image is no outline.
+    """Return the rotation of the lights that the outline shows, which the border of the image is not; None for none.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.

@@ -66,10 +66,7 @@ UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
 
 @runtime_checkable
 class ConfidentEstimator(Estimator, Protocol):
-    """An estimator that can also estimate its own accuracy.
-
-    tells_confidence: whether its weights allow that.
-    """
+    """An estimator that can also estimate its own accuracy, if its weights allow that."""
 
     @property
     def tells_confidence(self) -> bool: ...

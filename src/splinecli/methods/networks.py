@@ -51,10 +51,8 @@ class NetworkEstimator:
         interpolates = loaded.network.config.interpolates
         if interpolates == (name == "cnn-ps"):
             kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
-            raise ModelError(
-                f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
-                hint=f"Use them with --method {fitting}",
-            )
+            problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
+            raise ModelError(problem, hint=f"Use them with --method {fitting}")
         if rotations < 1 or batch_size < 1:
             raise UsageError("rotations and batch size are whole numbers from 1")
         self.name, self.weights = name, {"name": loaded.name, "sha256": loaded.sha256}

@@ -35,8 +35,7 @@ class ExpectedSize:
         """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
             raise InputError(
-                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}",
-                path=path,
+                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
             )
 
 
@@ -49,11 +48,8 @@ def check_stored_size(
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        raise InputError(
-            f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels",
-            path=path,
-            hint="If the size is right, use a smaller copy of the image",
-        )
+        problem = f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
+        raise InputError(problem, path=path, hint="If the size is right, use a smaller copy of the image")
     check_memory(n_bytes, takes, path)
 
 

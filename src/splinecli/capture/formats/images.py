@@ -51,10 +51,8 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
         check_stored_size(*size, path, expected)
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + _LONGEST_METADATA
         if length > most:  # it is read as a whole
-            raise InputError(
-                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
-                path=path,
-            )
+            problem = f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size"
+            raise InputError(problem, path=path)
         file.seek(0)
         pixels = _decode(file, kind, path)
     if expected is not None:
@@ -66,11 +64,8 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
-        raise InputError(
-            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
-            path=path,
-            hint="Save the image with 16 bits",
-        )
+        problem = f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones"
+        raise InputError(problem, path=path, hint="Save the image with 16 bits")
     if pixels.shape[2] in (2, 4):
         return pixels[:, :, :-1], pixels[:, :, -1]
     return pixels, None
@@ -185,11 +180,8 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise InputError("found a value that is not finite (NaN or infinity), expected a photograph", path=path)
     if lowest < 0:
-        raise InputError(
-            f"found the negative value {lowest:g}, expected a photograph",
-            path=path,
-            hint="Set values below zero, such as noise after a dark frame was subtracted, to zero",
-        )
+        hint = "Set values below zero, such as noise after a dark frame was subtracted, to zero"
+        raise InputError(f"found the negative value {lowest:g}, expected a photograph", path=path, hint=hint)
     return values
 
 

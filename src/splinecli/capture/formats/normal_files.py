@@ -220,11 +220,8 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
         found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
-        raise InputError(
-            f"found an array of {found}, expected floating-point numbers H x W",
-            path=path,
-            hint="Save the depth as .npy, floating-point TIFF or EXR",
-        )
+        problem = f"found an array of {found}, expected floating-point numbers H x W"
+        raise InputError(problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR")
     depth = np.array(stored, np.float64)
     depth[~np.isfinite(depth)] = np.nan
     return depth

@@ -39,11 +39,8 @@ def decode_tiff(file: BinaryIO, path: Path) -> NDArray[Any] | None:
         _check_complete(page, os.fstat(file.fileno()).st_size, path)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-            raise InputError(
-                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
-                path=path,
-                hint="Export it as RGB",
-            )
+            problem = f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            raise InputError(problem, path=path, hint="Export it as RGB")
         pixels = _decode_page(page)
         if photometric == _WHITE_IS_ZERO:
             if pixels is None:

@@ -78,9 +78,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
         raise NoImagesError(
-            "the folder contains no images",
-            path=folder,
-            hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images",
+            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images"
         )
 
 
@@ -203,11 +201,8 @@ def find_lights(folder: Path) -> Path | None:
         return plain
     named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
     if len(named) > 1:
-        raise InputError(
-            f"found {len(named)} light files: {', '.join(path.name for path in named)}",
-            path=folder,
-            hint="Choose one with --lights FILE",
-        )
+        problem = f"found {len(named)} light files: {', '.join(path.name for path in named)}"
+        raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
     return named[0] if named else find_named(folder, LIGHT_POSITIONS)
 
 

@@ -83,11 +83,9 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    raise InputError(
-        f"found no capture, expected folders of images with a light file ({LIGHT_FILES})",
-        path=folder,
-        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
-    )
+    problem = f"found no capture, expected folders of images with a light file ({LIGHT_FILES})"
+    hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
+    raise InputError(problem, path=folder, hint=hint)
 
 
 def _subfolders(folder: Path) -> list[Path]:

@@ -40,10 +40,8 @@ def draw_lights(
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        raise UsageError(
-            f"{n_lights} lights were requested, but the capture has {available}",
-            hint=f"Ask for at most {available} lights",
-        )
+        problem = f"{n_lights} lights were requested, but the capture has {available}"
+        raise UsageError(problem, hint=f"Ask for at most {available} lights")
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -119,10 +117,8 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    raise InputError(
-        f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws",
-        hint="Choose more lights, or lights that surround the viewing direction",
-    )
+    problem = f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws"
+    raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
 
 
 def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:

@@ -140,10 +140,8 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     positions, used = _find_positions(folder, lights, options)
     if positions is None and options.distance is None:
         if options.given is not None:
-            raise UsageError(
-                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
-                hint="Add --light-positions FILE or --light-distance D, or leave it out",
-            )
+            problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
+            raise UsageError(problem, hint="Add --light-positions FILE or --light-distance D, or leave it out")
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
     matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
@@ -178,11 +176,8 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """Return the 3 x 3 numbers of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
-        raise InputError(
-            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
-            path=path,
-            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
-        )
+        problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
+        raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
     return matrix
 
 
@@ -201,12 +196,8 @@ def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -
     away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
     if away.any():
         lamp = int(away.argmax())
-        raise InputError(
-            f"lamp {lamp + 1} shines away from the object",
-            path=path,
-            line=rows[lamp].line,
-            hint="The directions point from the lamps to the object",
-        )
+        hint = "The directions point from the lamps to the object"
+        raise InputError(f"lamp {lamp + 1} shines away from the object", path=path, line=rows[lamp].line, hint=hint)
     return lobes
 
 
@@ -217,12 +208,9 @@ def _read_pixel_size(path: Path) -> float:
     line, text = content[0]
     size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
-        raise InputError(
-            f'found "{text[:40]}", expected one number above 0, the width of a pixel',
-            path=path,
-            line=line,
-            hint="Write the number alone; its unit is that of the lamps' positions",
-        )
+        problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
+        hint = "Write the number alone; its unit is that of the lamps' positions"
+        raise InputError(problem, path=path, line=line, hint=hint)
     return size
 
 

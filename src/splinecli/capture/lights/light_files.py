@@ -113,12 +113,9 @@ def unit_directions(
     directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            raise InputError(
-                f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}",
-                path=path,
-                line=line,
-                hint="Write x y z towards the light, or remove the line and its image",
-            )
+            problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
+            hint = "Write x y z towards the light, or remove the line and its image"
+            raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
             raise InputError(
                 f"found a {'lamp behind the object' if lamps else 'light below the horizon'}{place}"
@@ -180,12 +177,8 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if not count.is_integer():
         expected = columns(len(following[0].numbers))
         raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
-    raise InputError(
-        f"the count line says {count:.0f}, but {len(following)} rows follow",
-        path=table.path,
-        line=first.line,
-        hint="Correct the count or leave it out",
-    )
+    problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
+    raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
 
 
 def _one_light_a_row(
@@ -202,20 +195,15 @@ def _one_light_a_row(
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.rows[0].text
         decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
-        raise InputError(
-            f"found {columns(n_columns)}, expected {expected}",
-            path=table.path,
-            line=table.rows[0].line,
-            hint=DECIMAL_POINT if decimal_commas else None,
-        )
+        problem = f"found {columns(n_columns)}, expected {expected}"
+        hint = DECIMAL_POINT if decimal_commas else None
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
-    raise InputError(
-        f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image",
-        path=table.path,
-        hint="The file needs one line for each image, in the order of the images",
-    )
+    problem = f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image"
+    hint = "The file needs one line for each image, in the order of the images"
+    raise InputError(problem, path=table.path, hint=hint)
 
 
 def rows_text(values: NDArray[np.float64]) -> str:

@@ -61,12 +61,8 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
                 hint = "The elevation counts from the image plane: 90 is the direction of the camera"
             raise InputError(problem, path=table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
-        raise InputError(
-            "no angle is above 2 pi, so they look like radians, expected degrees",
-            path=table.path,
-            line=table.rows[0].line,
-            hint="Multiply them by 180 / pi = 57.2958",
-        )
+        problem = "no angle is above 2 pi, so they look like radians, expected degrees"
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
 
 
 def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:

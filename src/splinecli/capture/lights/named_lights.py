@@ -99,12 +99,8 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
     if not count.isdecimal():
         raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
     if int(count[:_MOST_DIGITS]) != len(rows):
-        raise InputError(
-            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
-            path=path,
-            line=first,
-            hint="Correct the number, or restore the missing lines",
-        )
+        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
+        raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
     if not rows:
         raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
@@ -138,11 +134,8 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
             raise InputError(f"light {number} is not an object", path=path)
         kind = light.get("type", "directional")
         if kind != "directional":
-            raise InputError(
-                f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'",
-                path=path,
-                hint="Calibrate for distant lights, one direction a light",
-            )
+            problem = f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'"
+            raise InputError(problem, path=path, hint="Calibrate for distant lights, one direction a light")
         names.append(image_name(str(light.get("viewId", number)), []))
         vectors.append(_three_numbers(light, "direction", number, path))
         if "intensity" in light:

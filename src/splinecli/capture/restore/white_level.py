@@ -132,10 +132,8 @@ class Saturation:
         return WhiteLevel(float(full_scale), "full scale"), saturated
 
     def _stated_level(self, maximum: int) -> int | None:
-        """Return the level that all files state.
-
-        PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
-        """
+        """Return the level that all files state."""
+        # PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
         levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
@@ -177,11 +175,8 @@ def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, sta
     full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
     if given is not None:
         if full_scale is not None and given > full_scale:
-            raise InputError(
-                f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
-                path=path,
-                hint="Lower the white level, or leave it out",
-            )
+            problem = f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}"
+            raise InputError(problem, path=path, hint="Lower the white level, or leave it out")
         return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
     maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
     if not maximum:
