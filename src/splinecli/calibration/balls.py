@@ -162,7 +162,6 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
 
 
 def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
-    """Return the mean (H, W) of the gray values of images."""
     total: NDArray[np.float32] = read_image(images[0]).mean(axis=2)
     expected = ExpectedSize(total.shape, images[0].name)
     for path in images[1:]:

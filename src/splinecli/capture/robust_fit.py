@@ -13,11 +13,7 @@ Array = NDArray[np.floating]
 
 
 def shadow_weights(observations: Array) -> Array:
-    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows.
-
-    Args:
-        observations: (P, F), each pixel scaled to a largest value of 1.
-    """
+    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels scaled to a largest one of 1."""
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
@@ -76,9 +72,7 @@ def lit_values(observations: Array, dark_share: float, most: int) -> tuple[NDArr
     """Return at most `most` rows (p,) of observations (P, F), evenly spread over those that are not dark, and their
     values (p, F), each row scaled to a largest one of 1.
 
-    Args:
-        dark_share: pixels below this share of the brightest hundredth are dark, as the background of a capture without
-            a mask.
+    Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

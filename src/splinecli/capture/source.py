@@ -126,8 +126,7 @@ class CaptureSource:
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
-        Raises:
-            InputError: no object stands out, or an image cannot be read.
+        Raises InputError where no object stands out, or an image cannot be read.
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
@@ -184,8 +183,7 @@ class CaptureSource:
     def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
-        Raises:
-            InputError: a lamp would be inside the object.
+        Raises InputError where a lamp would be inside the object.
         """
         if self.lamps is None:
             return None, []
@@ -199,8 +197,7 @@ class CaptureSource:
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
-        Raises:
-            InputError: an image cannot be read, or does not have the size of the mask.
+        Raises InputError where an image cannot be read, or does not have the size of the mask.
         """
         reader = PixelReader(self.radiometry, mask, len(self.facts), self.window)
         like = self.files.images[indices[0]].name

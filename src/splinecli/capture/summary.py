@@ -88,9 +88,7 @@ class CaptureSummary:
 def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
-    Raises:
-        InputError: an image cannot be read, the mask, the ambient image or a flat field does not fit, or a lamp would
-            be inside the object.
+    Raises InputError where an image cannot be read or does not fit, or a lamp would be inside the object.
     """
     sizes = [facts.size[0][:2] for facts in source.facts]
     shape = sizes[0]

@@ -1,6 +1,6 @@
 """The checks of a capture's lights and images against each other, which `infer` and `info` make, in their order."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -31,20 +31,20 @@ that fit best leave less than this share of it. Right captures of flat metal lea
 
 _MOST_NAMED = 4  # shifted images in a sentence
 
-Check = Callable[[Evidence], list[CaptureWarning]]
+Check = Callable[[Evidence], Iterable[CaptureWarning]]
 
 
-def shifted_images(seen: Evidence) -> list[CaptureWarning]:
+def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
     shifts, names = seen.shifts, seen.names
     if not shifts:
-        return []
+        return
     named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
     text = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
         f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
-    return [CaptureWarning(codes.IMAGES_SHIFTED, text)]
+    yield CaptureWarning(codes.IMAGES_SHIFTED, text)
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
@@ -65,47 +65,33 @@ def doubted_lights(seen: Evidence) -> list[CaptureWarning]:
     return light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict)
 
 
-def missing_mask(seen: Evidence) -> list[CaptureWarning]:
-    if seen.background <= MOST_BACKGROUND:
-        return []
-    text = (
-        f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
-        " background mean nothing. Add --auto-mask, or give a mask."
-    )
-    return [CaptureWarning(codes.NO_MASK, text)]
+def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
+    if seen.background > MOST_BACKGROUND:
+        text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
+        text += " background mean nothing. Add --auto-mask, or give a mask."
+        yield CaptureWarning(codes.NO_MASK, text)
 
 
-def crowded_lights(seen: Evidence) -> list[CaptureWarning]:
+def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread >= SMALLEST_SPREAD:
-        return []
-    where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
-    text = (
-        f"The lights {where}, so noise and small errors of their directions grow about {1 / max(spread, 1e-3):.0f}"
-        " times in the normals. Add lights from other sides."
-    )
-    return [CaptureWarning(codes.LIGHTS_CROWDED, text)]
+    if spread < SMALLEST_SPREAD:
+        where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
+        times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
+        text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
+        yield CaptureWarning(codes.LIGHTS_CROWDED, text)
 
 
-def same_images(seen: Evidence) -> list[CaptureWarning]:
-    pairs = repeated_images(seen.sample.observations)
-    if not pairs:
-        return []
-    first, second = (seen.names[place] for place in pairs[0])
-    more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
-    text = (
-        f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by its"
-        " own photograph."
-    )
-    return [CaptureWarning(codes.REPEATED_IMAGES, text)]
+def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
+    if pairs := repeated_images(seen.sample.observations):
+        first, second = (seen.names[place] for place in pairs[0])
+        more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
+        text = f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by"
+        yield CaptureWarning(codes.REPEATED_IMAGES, f"{text} its own photograph.")
 
 
 def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     """Suggest to refine the lights where this makes them fit much better."""
-    if seen.has_positions:
-        return []
-    refined = would_refine(seen.observations, seen.factors, seen.directions)
-    if refined is None:
+    if seen.has_positions or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None:
         return []
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (

@@ -107,7 +107,6 @@ def _correlations(
 
 
 def _peak(correlations: NDArray[np.float32]) -> tuple[int, int]:
-    """Return the shift (right, down) of the largest correlation."""
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
     return int(right) - LARGEST, int(down) - LARGEST
 

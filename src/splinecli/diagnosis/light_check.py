@@ -153,7 +153,6 @@ def _check_frame_and_order(
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    """Return the best candidate, if it is better than the given one."""
     # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]

@@ -220,7 +220,6 @@ def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[T
 
 
 def _shift_words(order: int, n_lights: int) -> str:
-    """Return words for a row of shifted_orders."""
     steps = order % n_lights
     if order < n_lights:
         return f"if image 1 belongs to light {steps + 1}, image 2 to the next, and so on"

@@ -60,7 +60,6 @@ def _least_squares(*_: object) -> Estimator:
 
 
 def _solver(name: str, options: MethodOptions, *, module: str, batch_size: int) -> Estimator:
-    """Return a method whose `solve` is in a module of `splinecli.fits`."""
     from splinecli.methods.batched import BatchedEstimator
     from splinecli.system.devices import choose_device, use_available_cores
 

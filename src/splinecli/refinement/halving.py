@@ -82,10 +82,7 @@ class HalfCapture:
     def enlarged(self, box: Box) -> tuple[torch.Tensor, torch.Tensor]:
         """Return normals (3, h, w), not of unit length, and errors (2, h, w) in a box of the other capture's map.
 
-        They are interpolated bilinearly between pixels of the mask.
-
-        Args:
-            box: between even rows and columns.
+        They are interpolated bilinearly between pixels of the mask. The box is between even rows and columns.
         """
         rows, columns = (slice(max(0, side.start // 2 - 1), side.stop // 2 + 1) for side in box)
         mask = self.mask[rows]

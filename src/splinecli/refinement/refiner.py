@@ -113,7 +113,6 @@ class NetworkRefiner:
         self._refine(_Capture(around_object(mask), observations, light_of, normals, errors, *of_whole), progress)
 
     def _refine(self, capture: _Capture, progress: Progress | None = None) -> None:
-        """Refine a capture in place."""
         half, turns, margin, whole = None, self.turns, self.margin, (capture.normals, capture.errors)
         if len(capture.normals) > self.most_pixels:
             turns = 1

@@ -82,10 +82,7 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
 
-    `expected` says in messages what the file should be.
-
-    Raises:
-        InputError: the file is missing, no file, or has more than `most` bytes.
+    Raises InputError where it is missing, not `expected`, as messages call it, or has more than `most` bytes.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
@@ -129,10 +126,8 @@ def read_lines(
 def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
-    The arguments are those of read_text.
-
-    Raises:
-        InputError: with the line, for a word that is no finite number; also for a file without numbers.
+    The arguments are those of read_text. Raises InputError with the line for a word that is no finite number; also for
+    a file without numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
@@ -140,9 +135,7 @@ def read_number_rows(path: Path, *, expected: str = "a text file", most: int = M
 def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT) -> list[WordRow]:
     """Return the words of each line that has any, with points for decimal commas. Raises InputError.
 
-    Args:
-        n_numbers: how many numbers stand at the end of a line.
-        expected, most: see read_text.
+    At the end of a line, n_numbers stand. See read_text for the other arguments.
     """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]

@@ -34,8 +34,7 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 def list_folder(folder: Path) -> list[Path]:
     """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
 
-    Raises:
-        InputError: the folder is missing, is a file, or cannot be read.
+    Raises InputError where the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
@@ -85,8 +84,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
 def read_image_list(path: Path) -> tuple[Path, ...]:
     """Return the images that a filenames.txt names, one on each line, relative to its folder.
 
-    Raises:
-        InputError: with the line, for an image that does not exist or is named twice; also for an empty list.
+    Raises InputError with the line for an image that does not exist or is named twice; also for an empty list.
     """
     images: dict[Path, int] = {}
     for line, text in enumerate(read_lines(path), start=1):

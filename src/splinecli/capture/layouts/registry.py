@@ -42,9 +42,8 @@ PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
-    Raises:
-        InputError: the folder is missing, is a file or contains no images; filenames.txt names an image that
-            does not exist; there is no light file; or a file of the overrides does not exist.
+    Raises InputError where the folder is missing, is a file or contains no images; filenames.txt names an image that
+    does not exist; there is no light file; or a file of the overrides does not exist.
     """
     folder = Path(folder)
     list_folder(folder)  # raises where it is no folder

@@ -30,13 +30,9 @@ _XML = re.compile(
 
 
 def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
-    """Return the rows of the matrix of lights; the lines count them from 1.
+    """Return the rows of the matrix of lights, n_images of them if it is known; the lines count them from 1.
 
-    Args:
-        n_images: the number of lights that is expected, if it is known.
-
-    Raises:
-        InputError: the file is damaged, or of its matrices not one alone can be the lights.
+    Raises InputError where the file is damaged, or not one alone of its matrices can be the lights.
     """
     suffix = path.suffix.lower()
     if suffix == ".npy":

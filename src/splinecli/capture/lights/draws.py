@@ -72,8 +72,7 @@ class DrawsFile:
     def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
         """Raise InputError, with the line, for a draw that does not fit a capture under these lights (F, 3).
 
-        Args:
-            skipped: number of lights at the start that no draw may name.
+        No draw may name the first `skipped` lights.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
@@ -92,14 +91,10 @@ class DrawsFile:
 def read_draws(path: Path) -> DrawsFile:
     """Return the draws of a text file. Each line is one draw: light indices from 0, separated by spaces or commas.
 
-    "#" comments and blank lines are skipped.
-
-    Raises:
-        InputError: with the line, for a word that is no light index, a repeated index, fewer than three lights,
-            or a number of lights that differs from the first draw; also for a file without draws.
+    "#" comments and blank lines are skipped. Raises InputError with the line for a word that is no light index, a
+    repeated index, fewer than three lights, or another number than in the first draw; also for a file without draws.
     """
-    draws: list[Draw] = []
-    lines: list[int] = []
+    draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
         words = split_words(text.partition("#")[0])
         if words:

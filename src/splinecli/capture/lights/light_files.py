@@ -62,9 +62,8 @@ def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberR
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
     """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
 
-    Raises:
-        InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
-            rows that name their images.
+    Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
+    rows that name their images.
     """
     table = read_light_table(Path(path), n_images, "positions")
     positions, _ = lights_of(table, n_images, frame, "positions")
@@ -132,10 +131,8 @@ def unit_directions(
 def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    A single number for each light is used for all three channels.
-
-    Raises:
-        InputError: as for read_light_directions; also with the line, for an intensity that is no usable number.
+    A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
+    with the line for an intensity that is no usable number.
     """
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}

@@ -155,7 +155,6 @@ def _order_of(header: list[str]) -> list[int]:
 
 
 def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
-    """Return rows whose last numbers are in the order given."""
     first = -len(order)
 
     def reorder(row: Row) -> Row:

@@ -41,10 +41,8 @@ class NamedLights:
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
 
-        Images that no light names are left out, unless they are matched by order.
-
-        Raises:
-            InputError: two lights have one name, or neither the names nor the number of images fit.
+        Images that no light names are left out, unless they are matched by order. Raises InputError where two lights
+        have one name, or neither the names nor the number of images fit.
         """
         lines: dict[str, int | None] = {}
         for name, line in zip(self.names, self.lines, strict=True):
@@ -74,11 +72,8 @@ def read_lights(
 ) -> NamedLights | Array:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
-    Args:
-        frame: the frame of the file. That of a JSON file is relative to AliceVision's, which has y down and z away.
-
-    Raises:
-        InputError: see read_light_directions.
+    The frame of a JSON file is relative to AliceVision's, which has y down and z away. Raises InputError; see
+    read_light_directions.
     """
     if path.suffix.lower() in SUFFIXES:
         return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)

@@ -111,10 +111,7 @@ def would_refine(
 ) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
-    It is cheap where the given lights (F, 3) fit well.
-
-    Args:
-        factors: of the observations; see find_factors.
+    It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
     if factors is None or factors.misfits(light_directions[None])[0] < ROUGH_MISFIT:
         return None

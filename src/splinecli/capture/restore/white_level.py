@@ -114,7 +114,6 @@ class Saturation:
 
     @cached_property
     def _decision(self) -> tuple[WhiteLevel | None, list[NDArray[np.integer]]]:
-        """The white level, and the saturated pixels of each image."""
         saturated = [image.saturated for image in self.images]
         if self.given is not None:
             return WhiteLevel(float(self.given), "given"), saturated
@@ -132,7 +131,6 @@ class Saturation:
         return WhiteLevel(float(full_scale), "full scale"), saturated
 
     def _stated_level(self, maximum: int) -> int | None:
-        """Return the level that all files state."""
         # PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
         levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
