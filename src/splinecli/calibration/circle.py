@@ -27,7 +27,7 @@ _N_SAMPLES = 300  # random triples of points
 class Circle:
     """The outline of a ball."""
 
-    x: float  # x, y, radius: in pixels. All other numbers are defaults for a circle that the user gives
+    x: float  # x, y, radius: in pixels. The defaults below are those of a circle that the user gives
     y: float
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels

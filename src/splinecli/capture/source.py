@@ -173,13 +173,6 @@ class CaptureSource:
         check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
 
-    def lamps_over(self, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
-        """Return all lamps over a mask (H, W), or over one of every step-th row and column; None for none."""
-        if self.lamps is None:
-            return None
-        equal = not self.intensities_measured
-        return self.lamps.over(self.light_directions, mask, self.window, equal=equal, frame=self.light_frame, step=step)
-
     def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
@@ -187,7 +180,7 @@ class CaptureSource:
         """
         if self.lamps is None:
             return None, []
-        lamps = self.lamps_over(mask)
+        lamps = self.lamps.over(self, mask)
         if lamps is None or not self.lamps.used:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)

@@ -61,10 +61,6 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.IMAGE_ODD, text)]
 
 
-def doubted_lights(seen: Evidence) -> list[CaptureWarning]:
-    return light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict)
-
-
 def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
     if seen.background > MOST_BACKGROUND:
         text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
@@ -132,7 +128,7 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (shifted_images, frozenset()),
     (odd_image, frozenset()),
-    (doubted_lights, frozenset()),
+    (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), frozenset()),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),

@@ -52,8 +52,7 @@ class Evidence:
         strict: bool = False,
     ) -> Evidence:
         """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
-        sample, closeup = samples
-        used = source.lamps is not None and source.lamps.used
+        (sample, closeup), lamps = samples, source.lamps
         return cls(
             [source.files.images[index].name for index in indices],
             source.light_directions,
@@ -62,8 +61,8 @@ class Evidence:
             closeup,
             source.intensities_measured,
             source.intensities_known,
-            lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
-            has_positions=source.lamps is not None,
+            lamps=lamps.over(source, sample.mask, step=sample.step) if lamps is not None and lamps.used else None,
+            has_positions=lamps is not None,
             found=source.find_lights is not None,
             origin=source.files.light_directions or Path("light_directions"),
             frame=source.light_frame,

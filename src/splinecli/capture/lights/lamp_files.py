@@ -1,9 +1,11 @@
 """The files and options that say where near lamps are, and how large a pixel is."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,11 @@ from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
-from splinecli.capture.window import Window
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
+
+if TYPE_CHECKING:
+    from splinecli.capture.source import CaptureSource
 
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
@@ -91,28 +95,14 @@ class LampFiles:
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
         return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
-    def over(
-        self,
-        light_directions: NDArray[np.float64],
-        mask: NDArray[np.bool_],
-        window: Window,
-        *,
-        equal: bool,
-        frame: LightFrame,
-        step: int,
-    ) -> NearLamps | None:
-        """Return the lamps in these directions (F, 3) over what a window reads, with a mask; None without a scale.
-
-        Args:
-            equal: whether all lamps count as equally strong; see NearLamps.of.
-            frame: that of the file of positions.
-            step: the mask has every step-th row and column of what the window reads.
-        """
+    def over(self, source: CaptureSource, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
+        """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
+        window, frame, equal = source.window, source.light_frame, not source.intensities_measured
         if self.positions is not None:
-            positions = read_light_positions(self.positions, len(light_directions), frame)
+            positions = read_light_positions(self.positions, source.n_lights, frame)
         else:
             assert self.distance is not None
-            positions = light_directions * self.distance
+            positions = source.light_directions * self.distance
         pixel_size, camera_matrix = self.pixel_size, self.camera_matrix
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
