@@ -14,15 +14,7 @@ from splinecli.calibration.view import View, find_view, unit_rays
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
-from splinecli.capture.layouts.capture_files import (
-    FILENAMES,
-    MASK,
-    NOT_PHOTOGRAPHS,
-    check_not_empty,
-    find_named,
-    list_images,
-    read_image_list,
-)
+from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -72,26 +64,15 @@ class CalibratedLights:
 
     balls: tuple[BallCalibration, ...]
     directions: NDArray[np.float64]  # (F, 3) float64, unit vectors: the mean direction of the balls
-    # (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a single ball
-    disagreement_deg: NDArray[np.float64]
+    disagreement_deg: NDArray[np.float64]  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
     """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
 
-    Args:
-        mask: a mask that replaces the one in the folder.
-
-    Raises:
-        InputError: the folder does not exist, cannot be read, or has no images.
+    A mask that is given replaces the one in the folder. Raises InputError where there are no images.
     """
-    filenames = find_named(folder, [FILENAMES])
-    images = (
-        read_image_list(filenames)
-        if filenames is not None
-        else list_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
-    )
-    check_not_empty(images, folder)
+    images, _ = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
     others = list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
     return BallFiles(folder, images, reference, mask or find_named(folder, MASK))
@@ -128,11 +109,8 @@ def calibrate_ball(
         if not circle.inside(shape).any():
             raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
-            highlight = find_highlight(
-                to_linear(stored, path).mean(axis=2),
-                circle,
-                full_scale=1.0 if stored.dtype.kind == "u" else None,
-            )
+            full_scale = 1.0 if stored.dtype.kind == "u" else None
+            highlight = find_highlight(to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale)
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
             check_in_front(direction[0], unit_rays(point, view.matrix)[0])
@@ -149,17 +127,11 @@ def calibrate_ball(
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls.
-
-    Raises:
-        InputError: the balls have different numbers of images.
-    """
-    counts = [len(ball.directions) for ball in balls]
-    if len(set(counts)) > 1:
-        raise InputError(
-            "the balls have " + ", ".join(f"{n} images ({b.files.folder})" for n, b in zip(counts, balls, strict=True)),
-            hint="Every ball needs one image for each light, in the same order",
-        )
+    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers of images."""
+    if len({len(ball.directions) for ball in balls}) > 1:
+        counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)
+        hint = "Every ball needs one image for each light, in the same order"
+        raise InputError(f"the balls have {counts}", hint=hint)
     stacked = np.stack([ball.directions for ball in balls])
     directions = unit(stacked.sum(axis=0))
     disagreement = np.stack([angle_between_deg(own, directions) for own in stacked]).max(axis=0)
@@ -190,7 +162,6 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
 
 
 def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
-    """Return the mean (H, W) of the gray values of images."""
     total: NDArray[np.float32] = read_image(images[0]).mean(axis=2)
     expected = ExpectedSize(total.shape, images[0].name)
     for path in images[1:]:

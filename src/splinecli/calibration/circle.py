@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 
 RAYS = 720
-MIN_VISIBLE = 0.35
-"""Smallest visible share of an outline. A shorter arc may be the edge of another object."""
-
+MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
 _TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it
@@ -29,16 +27,12 @@ _N_SAMPLES = 300  # random triples of points
 class Circle:
     """The outline of a ball."""
 
-    # x, y, radius: centre and radius, in pixels
-    x: float
+    x: float  # x, y, radius: in pixels. The defaults below are those of a circle that the user gives
     y: float
     radius: float
-    # rms distance of the outline's points from the circle, in pixels. 0 for a circle that the user gives
-    spread: float = 0.0
-    # share of the outline that the image or mask shows, 0 to 1. 1 for a circle that the user gives
-    visible: float = 1.0
-    # (N, 2), the points of the outline; None for a circle that the user gives
-    points: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
+    spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
+    visible: float = 1.0  # share of the outline that the image or mask shows, 0 to 1
+    points: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
 
     @property
     def outline(self) -> NDArray[np.float64]:
@@ -57,8 +51,7 @@ class Circle:
     def inside(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Return the mask (H, W) of the pixels inside the circle."""
         y, x = np.indices(shape[:2])
-        inside: NDArray[np.bool_] = (x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2
-        return inside
+        return np.asarray((x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2)
 
     def reaches_beyond(self, shape: tuple[int, ...]) -> bool:
         """Return whether a hundredth of the radius or more lies outside the image."""
@@ -69,11 +62,7 @@ class Circle:
 
 
 def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
-    """Return the circle through most of the outline of the largest part of a mask (H, W).
-
-    Raises:
-        InputError: the outline is not that of a ball.
-    """
+    """Return the circle through most of the outline of the largest part of a mask (H, W). Raises InputError."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     height, width = mask.shape
@@ -88,19 +77,13 @@ def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
     outline = outline + 0.5 * from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < MIN_VISIBLE:
-        raise InputError(
-            f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball",
-            hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R",
-        )
+        problem = f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball"
+        raise InputError(problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R")
     return circle
 
 
 def find_circle(image: NDArray[Any]) -> Circle:
-    """Return the clearest circle in a gray image (H, W), such as a ball in front of another background.
-
-    Raises:
-        InputError: there is no clear circle.
-    """
+    """Return the clearest circle in a gray image (H, W), such as a ball on another background. Raises InputError."""
     values = image.astype(np.float32)
     # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
     values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
@@ -141,10 +124,7 @@ def _merit(circle: Circle) -> float:
 
 
 def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
-    """Return the circle through the strongest edges along rays from the centre of the guess, or None.
-
-    The result is None where too few edges agree on a circle.
-    """
+    """Return the circle through the strongest edges along rays from the guess's centre; None where too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         angle = np.arange(RAYS) * (2 * np.pi / RAYS)
         half = max(band * guess.radius, 3.0)
@@ -155,11 +135,11 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
             values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
             borderValue=float("nan"),
         )  # fmt: skip
-        edge = np.abs(cv2.GaussianBlur(sampled, (9, 1), 2)[:, 2:] - cv2.GaussianBlur(sampled, (9, 1), 2)[:, :-2])
+        smooth = cv2.GaussianBlur(sampled, (9, 1), 2)
+        edge = np.abs(smooth[:, 2:] - smooth[:, :-2])
         edge[~np.isfinite(edge)] = 0
         peak = edge[:, 1:-1].argmax(axis=1) + 1
-        strength = edge[np.arange(RAYS), peak]
-        before, after = edge[np.arange(RAYS), peak - 1], edge[np.arange(RAYS), peak + 1]
+        before, strength, after = (edge[np.arange(RAYS), peak + step] for step in (-1, 0, 1))
         # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
@@ -174,15 +154,13 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
 
 
 def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
-    """Return the circle that most points (N, 2) lie on.
+    """Return the circle that most points (N, 2) lie on; a complete outline would have `outline_points`.
 
-    RANSAC with samples of three points, then least squares over the points close to the circle. `outline_points` is
-    the number of points of a complete outline, to which the visible share refers.
+    RANSAC with samples of three points, then least squares over the points close to the circle.
     """
-    generator = np.random.default_rng(0)
+    generator, size = np.random.default_rng(0), np.ptp(points, axis=0).max()
     best: tuple[float, float, float] | None = None
     most = -1
-    size = np.ptp(points, axis=0).max()
     for _ in range(_N_SAMPLES):
         circle = _through(points[generator.choice(len(points), 3, replace=False)])
         if circle is None or not 0.2 * size < circle[2] < 3 * size:
@@ -199,9 +177,8 @@ def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
         # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). Centring the points keeps it accurate.
         middle = close_by.mean(axis=0)
         around = close_by - middle
-        a, b, c = np.linalg.lstsq(
-            np.column_stack((2 * around, np.ones(len(around)))), (around**2).sum(axis=1), rcond=None
-        )[0]
+        terms = np.column_stack((2 * around, np.ones(len(around))))
+        a, b, c = np.linalg.lstsq(terms, (around**2).sum(axis=1), rcond=None)[0]
         best = (float(middle[0] + a), float(middle[1] + b), math.sqrt(max(c + a * a + b * b, 1e-9)))
     distance = _distance(points, best)
     close = distance < _TOLERANCE * best[2]
@@ -223,5 +200,4 @@ def _through(three: NDArray[np.float64]) -> tuple[float, float, float] | None:
 
 def _distance(points: NDArray[np.float64], circle: tuple[float, float, float]) -> NDArray[np.float64]:
     x, y, radius = circle
-    distance: NDArray[np.float64] = np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius)
-    return distance
+    return np.asarray(np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius))

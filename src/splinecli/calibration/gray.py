@@ -50,9 +50,8 @@ def measure_light_intensities(
     """
     n_lights = len(light_directions)
     if len(files.images) != n_lights:
-        raise InputError(
-            f"found {len(files.images)} images, expected {n_lights}, one for each light", path=files.folder
-        )
+        problem = f"found {len(files.images)} images, expected {n_lights}, one for each light"
+        raise InputError(problem, path=files.folder)
     mask, normals = _target_normals(files, files.facts[0].size[0][:2], target)
     check_exposures(files.facts)
     capture = CaptureSource(
@@ -79,11 +78,9 @@ def measure_light_intensities(
         ratios = ratios[(cosines[:, position] > SMALLEST_COSINE) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= _MIN_PIXELS else np.zeros(1)
         if not ((intensity > 0) & np.isfinite(intensity)).all():
-            raise InputError(
-                "the target is dark or overexposed under this light, so the light's intensity is unknown",
-                path=path,
-                hint="Every light needs an image of the target that is neither black nor saturated",
-            )
+            problem = "the target is dark or overexposed under this light, so the light's intensity is unknown"
+            hint = "Every light needs an image of the target that is neither black nor saturated"
+            raise InputError(problem, path=path, hint=hint)
         intensities[position] = intensity
     return np.asarray(intensities / intensities.mean())
 

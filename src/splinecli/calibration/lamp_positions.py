@@ -43,15 +43,10 @@ class LampPositions:
     view: View
 
     @property
-    def distances(self) -> Floats:
-        return np.asarray(np.linalg.norm(self.positions, axis=1))
-
-    @property
     def known(self) -> bool:
         """Whether every lamp has a position in front of the balls that the rays determine well."""
-        return bool(
-            (self.positions[:, 2] > 0).all() and (self.uncertainty <= LARGEST_UNCERTAINTY * self.distances).all()
-        )
+        most = LARGEST_UNCERTAINTY * np.linalg.norm(self.positions, axis=1)
+        return bool((self.positions[:, 2] > 0).all() and (self.uncertainty <= most).all())
 
 
 def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
@@ -82,19 +77,12 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
 
 
 def _positions(
-    balls: Sequence[BallCalibration],
-    matrix: Floats,
-    ball_diameter: float | None,
-    generator: np.random.Generator | None = None,
+    balls: Sequence[BallCalibration], matrix: Floats, diameter: float | None, errors: np.random.Generator | None = None
 ) -> tuple[Floats, float, float]:
-    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
-
-    Args:
-        generator: draws errors of the pixels; None for the pixels as they are.
-    """
+    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other."""
 
     def error(*shape: int) -> Floats:
-        return np.zeros(shape) if generator is None else generator.normal(size=shape)
+        return np.zeros(shape) if errors is None else errors.normal(size=shape)
 
     centres = np.array([ball_centre(ball.circle.outline + PIXEL_ERROR * error(2), matrix) for ball in balls])
     depths = -centres[:, 2]
@@ -106,24 +94,21 @@ def _positions(
     centres *= (likely / depths)[:, None]
     height, width = balls[0].shape
     origin = np.array(((width - 1) / 2, (height - 1) / 2, 1.0)) @ ray_basis(matrix) * plane
-    found = [
-        reflect(centre, ball.points + PIXEL_ERROR * error(*ball.points.shape), matrix)
-        for centre, ball in zip(centres, balls, strict=True)
-    ]
-    starts = np.array([centre - origin + normals for centre, (normals, _) in zip(centres, found, strict=True)])
-    points, miss = intersect_rays(starts, np.array([directions for _, directions in found]))
+    starts, towards = [], []
+    for centre, ball in zip(centres, balls, strict=True):
+        normals, directions = reflect(centre, ball.points + PIXEL_ERROR * error(*ball.points.shape), matrix)
+        starts.append(centre - origin + normals)
+        towards.append(directions)
+    points, miss = intersect_rays(np.array(starts), np.array(towards))
     pixel = plane / focal_length(matrix)  # in radii of the balls
-    unit = 1 / pixel if ball_diameter is None else ball_diameter / 2
+    unit = 1 / pixel if diameter is None else diameter / 2
     return points * unit, pixel * unit, miss
 
 
 def intersect_rays(starts: Floats, directions: Floats) -> tuple[Floats, float]:
     """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays miss them.
 
-    The directions are taken to have equal random errors. A ray with NaN gives NaN.
-
-    Args:
-        starts, directions: (B, F, 3), unit directions, B at least 2.
+    The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN gives NaN.
     """
     usable = np.isfinite(directions).all(axis=(0, 2))
     points = np.full(starts.shape[1:], np.nan)

@@ -62,10 +62,8 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     y, x = np.nonzero(core)
     width = max(np.ptp(x), np.ptp(y))
     if width > _MAX_WIDTH * 2 * circle.radius:
-        raise InputError(
-            f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp",
-            hint="Shorten the exposure, or cover windows and bright walls",
-        )
+        problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
+        raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
     weight = smooth[core].astype(np.float64) - 0.9 * HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
@@ -78,8 +76,7 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
     linear. Written with m_z + 1, it is also exact for a camera that is far away.
     """
-    rays = np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)
-    x, y = rays[:, 0], rays[:, 1]
+    x, y, _ = (np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)).T
     equations = np.column_stack((x, y, np.ones(len(x))))
     right_side = (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1))
     kept = np.ones(len(x), np.bool_)
@@ -104,7 +101,5 @@ def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats,
 def check_in_front(direction: Floats, ray: Floats) -> None:
     """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
     if not direction @ ray < 0:
-        raise InputError(
-            "the highlight is near the rim of the ball: the lamp is level with the ball or behind it",
-            hint="Place all lights on the camera's side of the object",
-        )
+        problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
+        raise InputError(problem, hint="Place all lights on the camera's side of the object")

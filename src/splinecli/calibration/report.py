@@ -31,7 +31,6 @@ def calibration_report(
         intensities: (F, 3), or None where they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.
-        lamps: the positions from several balls, or None.
     """
     single, view = len(lights.balls) == 1, lights.balls[0].view
     off_deg = None if known_directions is None else angle_between_deg(known_directions, lights.directions)
@@ -63,12 +62,8 @@ def calibration_report(
             "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
             "pixel_size": _round(lamps.pixel_size, 6),
         },
-        "disagreement_deg": None
-        if single
-        else {"mean": _round(lights.disagreement_deg.mean()), "largest": _round(lights.disagreement_deg.max())},
-        "compared": None
-        if off_deg is None
-        else {"mean_deg": _round(off_deg.mean()), "largest_deg": _round(off_deg.max())},
+        "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg),
+        "compared": None if off_deg is None else _mean_and_largest(off_deg, "_deg"),
         "warnings": _warnings(lights, known_directions, picture, lamps),
     }
 
@@ -83,11 +78,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" (from {circle['from']}, {100 * circle['seen']:.0f} % of the outline visible,"
             f" spread {circle['spread']:.1f} pixels)"
         )
-    if report["disagreement_deg"]:
-        angles = report["disagreement_deg"]
-        lines.append(
-            f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
-        )
+    if angles := report["disagreement_deg"]:
+        text = f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
+        lines.append(text)
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
         lines.append("the lamps' distances are unknown: they count as distant")
@@ -99,12 +92,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
             f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
         )
-    if report["compared"]:
-        angles = report["compared"]
-        lines.append(
-            f"the compared file differs by {angles['mean_deg']:.1f} degrees on average,"
-            f" at most {angles['largest_deg']:.1f}"
-        )
+    if angles := report["compared"]:
+        text = f"the compared file differs by {angles['mean_deg']:.1f} degrees on average, at most"
+        lines.append(f"{text} {angles['largest_deg']:.1f}")
     return lines
 
 
@@ -142,6 +132,10 @@ def _warnings(
                 " each lies half-way between the view and the light. Use the file written here."
             )
     return warnings
+
+
+def _mean_and_largest(angles_deg: NDArray[np.float64], unit: str = "") -> dict[str, float]:
+    return {f"mean{unit}": _round(angles_deg.mean()), f"largest{unit}": _round(angles_deg.max())}
 
 
 def _rows(values: NDArray[np.float64]) -> list[list[float]]:

@@ -63,8 +63,7 @@ def unit_rays(points: Floats, matrix: Floats) -> Floats:
 def find_view(image: ImageFacts, matrix: Path | None) -> View:
     """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
 
-    Raises:
-        InputError: the file or the image cannot be read, or the file has no camera matrix.
+    Raises InputError where the file or the image cannot be read, or the file has no camera matrix.
     """
     height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
@@ -72,11 +71,10 @@ def find_view(image: ImageFacts, matrix: Path | None) -> View:
         given = read_camera_matrix(matrix)
         ray_basis(given)  # refuses other numbers
         return View(given, "--camera-matrix", shortest)
-    focal = _focal_length(image.exif or {}, width, height)
-    middle = (width - 1) / 2, (height - 1) / 2
-    source = "assumed distant" if focal is None else "EXIF"
-    focal = focal or DISTANT
-    return View(np.array(((focal, 0, middle[0]), (0, focal, middle[1]), (0, 0, 1.0))), source, shortest)
+    found = _focal_length(image.exif or {}, width, height)
+    focal = found or DISTANT
+    given = np.array(((focal, 0, (width - 1) / 2), (0, focal, (height - 1) / 2), (0, 0, 1.0)))
+    return View(given, "assumed distant" if found is None else "EXIF", shortest)
 
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:

@@ -61,7 +61,9 @@ def capture_from_arrays(
         raise UsageError("light_directions is None, but near lamps need positions", hint="Leave pixel_size out")
     directions = placeholders(n_lights) if light_directions is None else _checked_directions(light_directions, n_lights)
     intensities = _checked_intensities(light_intensities, n_lights)
-    inside = np.ones(shape, np.bool_) if mask is None else _inside(np.asarray(mask))
+    inside = np.ones(shape, np.bool_) if mask is None else np.asarray(mask)
+    if inside.dtype != np.bool_:  # the rule of mask files for numbers
+        inside = inside > max(inside.max(initial=0) / 2, 0)
     if inside.shape != shape:
         raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
 
@@ -74,15 +76,8 @@ def capture_from_arrays(
     observations, saturation, warnings = collect_observations(
         pixels(), int(inside.sum()), n_lights, white_level=white_level
     )
-    capture = Capture(
-        name="capture",
-        observations=observations,
-        light_directions=directions,
-        light_indices=tuple(range(n_lights)),
-        mask=inside,
-        warnings=tuple(warnings),
-        white_level=saturation.white_level,
-    )
+    indices, level = tuple(range(n_lights)), saturation.white_level
+    capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
@@ -94,30 +89,19 @@ def capture_from_arrays(
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 
-def _inside(mask: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the pixels of the object, by the rule of mask files for numbers."""
-    if mask.dtype == np.bool_ or not mask.size:
-        return mask.astype(np.bool_)
-    inside: NDArray[np.bool_] = mask > max(mask.max() / 2, 0)
-    return inside
-
-
 def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     stack = [np.asarray(image) for image in images]  # type: ignore[union-attr]
     if not stack:
         raise UsageError("found no images, expected (F, H, W) or (F, H, W, 3)")
     for index, image in enumerate(stack):
-        if image.shape != stack[0].shape:
-            raise UsageError(
-                f"found an image of shape {image.shape} at images[{index}], expected {stack[0].shape} as images[0]"
-            )
+        first = stack[0].shape
+        if image.shape != first:
+            raise UsageError(f"found an image of shape {image.shape} at images[{index}], expected {first} as images[0]")
         if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
         if image.dtype not in _KINDS and image.dtype.kind != "f":
-            raise UsageError(
-                f"found images of type {image.dtype}, expected uint8, uint16 or floating point",
-                hint="Convert them with images.astype(...), without a change of scale",
-            )
+            problem = f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
+            raise UsageError(problem, hint="Convert them with images.astype(...), without a change of scale")
     return stack
 
 
@@ -141,9 +125,8 @@ def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> NDArra
     if values.shape == (n_lights,):
         values = values[:, None]
     if values.shape not in ((n_lights, 1), (n_lights, 3)):
-        raise UsageError(
-            f"found light intensities of shape {values.shape}, expected (F,) or (F, 3) with F = {n_lights}"
-        )
+        shape = values.shape
+        raise UsageError(f"found light intensities of shape {shape}, expected (F,) or (F, 3) with F = {n_lights}")
     if not (np.isfinite(values) & (values > 0)).all():
         raise InputError("a light intensity is not a finite number above 0")
     return np.broadcast_to(values, (n_lights, 3))

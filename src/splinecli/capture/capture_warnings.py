@@ -10,13 +10,9 @@ from splinecli.capture.restore.white_level import WhiteLevel
 
 @dataclass(frozen=True)
 class CaptureWarning:
-    """A fault of a capture that reduces accuracy, or a decision that was made for the user.
+    """A fault of a capture that reduces accuracy, or a decision that was made for the user."""
 
-    Args:
-        code: a name that stays the same when the sentence changes; one of the constants below.
-    """
-
-    code: str
+    code: str  # a name that stays the same when the sentence changes; one of the constants below
     text: str
 
     def __str__(self) -> str:
@@ -63,21 +59,10 @@ UNEQUAL_INTENSITIES = "unequal_intensities"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
-PROBABLY_WRONG = frozenset(
-    {
-        ENCODED_VALUES,
-        GROUND_TRUTH_FRAME,
-        GROUND_TRUTH_Z,
-        IMAGE_ODD,
-        IMAGES_SHIFTED,
-        LAMP_DISTANCE,
-        LAMPS_NEAR,
-        LIGHT_FRAME,
-        LIGHT_ORDER,
-        LOW_CONFIDENCE,
-        REPEATED_IMAGES,
-    }
-)
+PROBABLY_WRONG = frozenset({
+    ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR,
+    LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, REPEATED_IMAGES,
+})  # fmt: skip
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 
 SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning

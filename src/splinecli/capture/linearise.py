@@ -27,19 +27,13 @@ _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show 
 
 @dataclass(frozen=True)
 class RadiometricCalibration:
-    """How stored values become linear light.
+    """How stored values become linear light."""
 
-    Args:
-        curve: the images' transfer curve.
-        automatic: whether the curve that all images state is used in its place.
-        ambient: an image under ambient light alone, which is subtracted from all others.
-        flat_field: images of an evenly white surface, one for each light or one for all. Images are divided by them.
-    """
-
-    curve: TransferCurve = 1.0
-    ambient: Path | None = None
+    curve: TransferCurve = 1.0  # the images' transfer curve
+    ambient: Path | None = None  # an image under ambient light alone, which is subtracted from all others
+    # images of an evenly white surface, one for each light or one for all. Images are divided by them
     flat_field: tuple[Path, ...] = ()
-    automatic: bool = False
+    automatic: bool = False  # whether the curve that all images state is used in place of `curve`
 
     def with_stated_curve(self, images: Sequence[ImageFacts]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
@@ -95,21 +89,15 @@ class PixelReader:
     """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
 
     def __init__(
-        self,
-        radiometry: RadiometricCalibration,
-        mask: NDArray[np.bool_],
-        n_images: int,
-        window: Window = WHOLE,
+        self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int, window: Window = WHOLE
     ) -> None:
         """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
         self.radiometry = radiometry
         self.mask, self._window = mask, window
         flats = radiometry.flat_field
         if len(flats) not in (0, 1, n_images):
-            raise InputError(
-                f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image",
-                path=flats[0].parent,
-            )
+            problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+            raise InputError(problem, path=flats[0].parent)
         self._ambient: NDArray[np.float32] | None = None
         if radiometry.ambient is not None:
             self._ambient = self._read(radiometry.ambient, "the other images")[1]
@@ -118,8 +106,7 @@ class PixelReader:
     def read(self, path: Path, index: int, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
         """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
 
-        Args:
-            like: the image of the expected size, for messages.
+        Messages name `like` as the image of the expected size.
         """
         stored, linear = self._read(path, like)
         if len(self.radiometry.flat_field) > 1:
@@ -185,13 +172,8 @@ def collect_observations(
 ) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
     """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
 
-    Only one image is in memory at a time.
-
-    Args:
-        white_level: the one that the user gave; None to find it.
-
-    Raises:
-        InputError: the white level that the user gave is above an image's full scale.
+    Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
+    it is above an image's full scale.
     """
     observations = np.empty((n_pixels, n_images), np.float32)
     any_8_bit, found = False, []

@@ -3,6 +3,8 @@
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from splinecli.errors import InputError
@@ -15,11 +17,7 @@ StrPath = str | os.PathLike[str]  # a path in any form that the standard library
 
 
 def find_mode(path: Path) -> int | None:
-    """Return the mode (see stat) of what is at the path, following links; None for nothing.
-
-    Raises:
-        InputError: the system refuses to answer.
-    """
+    """Return the mode (see stat) of what is at the path, following links; None for nothing. Raises InputError."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -33,8 +31,7 @@ def find_mode(path: Path) -> int | None:
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
 
-    Args:
-        pipe: whether the shell's process substitution `<(...)` may stand in its place, see is_substitution.
+    With `pipe`, the shell's process substitution `<(...)` may stand in its place, see is_substitution.
     """
     mode = find_mode(path)
     if mode is None:
@@ -43,11 +40,19 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
         raise InputError(f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path)
 
 
+@contextmanager
+def reading(path: Path, what: str = "file") -> Iterator[None]:
+    """Turn an error of the system while a file is read into an InputError that names it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"the {what} cannot be read ({error.strerror})", path=path) from None
+
+
 def is_found_file(path: Path) -> bool:
     """Return whether an entry of a folder, with the name of a file that is read, is a file; False for a folder.
 
-    Raises:
-        InputError: it is anything else, such as a pipe or a broken link. To pass over it would hide that.
+    Raises InputError for anything else, such as a pipe or a broken link. To pass over it would hide that.
     """
     if is_folder(path):
         return False

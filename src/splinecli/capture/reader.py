@@ -79,10 +79,8 @@ def open_capture(
     near = None if find_lights is not None else find_lamps(Path(folder), overrides.lights, lamps)
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
-            raise UsageError(
-                f"--lights-format {lights_format} concerns light directions, but {near.positions} has positions",
-                hint="Leave it out, or use --light-distance with a file of directions",
-            )
+            problem = f"--lights-format {lights_format} concerns light directions, but {near.positions} has positions"
+            raise UsageError(problem, hint="Leave it out, or use --light-distance with a file of directions")
         overrides, form = replace(overrides, lights=near.positions), "positions"
     if near is not None and near.object_width is not None and window.box is not None:
         raise UsageError("--object-width needs the whole object in the image", hint="Give --pixel-size beside --crop")
@@ -157,12 +155,7 @@ def read_capture(
 ) -> Capture:
     """Open a capture and read it: see open_capture and CaptureSource.read."""
     source = open_capture(
-        folder,
-        lights=lights,
-        intensities=intensities,
-        mask=mask,
-        ground_truth=ground_truth,
-        white_level=white_level,
+        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
     )
     return source.read(light_indices, progress, as_stored=as_stored)
 
@@ -170,10 +163,7 @@ def read_capture(
 def _read_lights(
     files: CaptureFiles, frame: LightFrame, form: RowForm
 ) -> tuple[CaptureFiles, NDArray[np.float64], NDArray[np.float64] | None, list[CaptureWarning]]:
-    """Return the files, the light directions (F, 3), the intensities (F, 3) that come with them, and warnings.
-
-    A light file that names images sets their order.
-    """
+    """Return the files in the order of the lights, the directions (F, 3), their intensities (F, 3), and warnings."""
     path = files.light_directions
     if path is None:
         return files, placeholders(len(files.images)), None, []
@@ -203,11 +193,7 @@ def _read_lights(
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
 ) -> tuple[tuple[Path, ...], NDArray[np.float64] | NamedLights]:
-    """Return the images that a light file is for, and its lights: all images, or else those of the usual size.
-
-    Raises:
-        InputError: what read_lights raises for all images.
-    """
+    """Return the images that a light file is for, and its lights: all images, or else those of the usual size."""
     try:
         return images, read_lights(path, len(images), frame, form)
     except InputError:
@@ -224,10 +210,6 @@ def _match_count(
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> NDArray[np.float64]:
     """Return the intensities (F, 3) of images from a file with a line for each, or for each image of the folder."""
     if len(images) < len(in_folder):
-        try:
-            intensities = read_light_intensities(path, len(in_folder))
-        except InputError:
-            pass  # the file is for the chosen images, or wrong in any case
-        else:
-            return intensities[[in_folder.index(image) for image in images]]
+        with suppress(InputError):  # the file is for the chosen images, or wrong in any case
+            return read_light_intensities(path, len(in_folder))[[in_folder.index(image) for image in images]]
     return read_light_intensities(path, len(images))

@@ -117,11 +117,7 @@ class Capture:
         )
 
     def choose_pixels(self, positions: NDArray[np.integer]) -> Capture:
-        """Return the same capture with some of its pixels, in rising order.
-
-        Args:
-            positions: rising zero-based positions among this record's pixels.
-        """
+        """Return the same capture with some of its pixels, from their rising zero-based positions in this record."""
         mask = np.zeros_like(self.mask)
         # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
         mask.flat[np.flatnonzero(self.mask)[positions]] = True
@@ -140,27 +136,20 @@ class Capture:
         if len(self.light_indices) != len(lights):
             raise InputError(f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights")
         if len(lights) < MIN_LIGHTS:
-            raise InputError(
-                f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}",
-                hint="A normal has three unknowns, so three images under different lights are the fewest",
-            )
+            hint = "A normal has three unknowns, so three images under different lights are the fewest"
+            raise InputError(f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}", hint=hint)
         self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")
         if (np.abs(np.linalg.norm(lights, axis=1) - 1) > _UNIT_TOLERANCE).any():
             raise InputError(f"{self.name}: a light direction is not a unit vector")
         if (lights[:, 2] <= 0).any():
-            below = int(np.argmax(lights[:, 2] <= 0))
-            raise InputError(
-                f"{self.name}: light {self.light_indices[below]} lies below the horizon (z <= 0)",
-                hint="z points to the camera",
-            )
+            below = self.light_indices[int(np.argmax(lights[:, 2] <= 0))]
+            problem = f"{self.name}: light {below} lies below the horizon (z <= 0)"
+            raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
-            raise InputError(
-                f"{self.name}: the {len(lights)} lights lie in one plane,"
-                " so least squares (LS) cannot solve for a normal",
-                hint="Choose lights that surround the viewing direction",
-            )
+            problem = f"{self.name}: the {len(lights)} lights lie in one plane, so least squares (LS) cannot solve"
+            raise InputError(f"{problem} for a normal", hint="Choose lights that surround the viewing direction")
 
     def _check_observations(self) -> None:
         if self.mask.ndim != 2:
@@ -195,18 +184,15 @@ def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
 
 
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
-    """Return the indices as a tuple of ints, in their order, after checking that they choose among n_lights lights.
+    """Return the indices as a tuple of ints, in their order.
 
-    Raises:
-        UsageError: an index is out of range, comes twice, or there are fewer than three.
+    Raises UsageError where one is not among n_lights, or comes twice, and for fewer than three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):
         if not 0 <= index < n_lights:
-            raise UsageError(
-                f"light index {index} is out of range: the capture has {n_lights} lights",
-                hint=f"Light indices count from 0 to {n_lights - 1}",
-            )
+            problem = f"light index {index} is out of range: the capture has {n_lights} lights"
+            raise UsageError(problem, hint=f"Light indices count from 0 to {n_lights - 1}")
         if index in chosen[:position]:
             raise UsageError(f"light index {index} comes twice", hint="Name each light once")
     if len(chosen) < MIN_LIGHTS:

@@ -13,11 +13,7 @@ Array = NDArray[np.floating]
 
 
 def shadow_weights(observations: Array) -> Array:
-    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows.
-
-    Args:
-        observations: (P, F), each pixel scaled to a largest value of 1.
-    """
+    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels scaled to a largest one of 1."""
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
@@ -50,8 +46,7 @@ def _sum_over_lights(values: Array, terms: Array) -> Array:
 
 def absolute_weights(residuals: Array) -> Array:
     """Return weights with which the next weighted least squares approximates least absolute deviations."""
-    weights: Array = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
-    return weights
+    return np.asarray(1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW))
 
 
 def fit_robustly(
@@ -73,14 +68,14 @@ def fit_robustly(
     return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
 
 
-def lit_rows(observations: Array, dark_share: float, most: int) -> NDArray[np.intp]:
-    """Return at most `most` rows of observations (P, F), evenly spread over those that are not dark.
+def lit_values(observations: Array, dark_share: float, most: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return at most `most` rows (p,) of observations (P, F), evenly spread over those that are not dark, and their
+    values (p, F), each row scaled to a largest one of 1.
 
-    Args:
-        dark_share: pixels below this share of the brightest hundredth are dark, as the background of a capture without
-            a mask.
+    Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))
-    chosen: NDArray[np.intp] = lit[np.linspace(0, len(lit) - 1, min(len(lit), most)).astype(int)]
-    return chosen
+    chosen = lit[np.linspace(0, len(lit) - 1, min(len(lit), most)).astype(int)]
+    values = observations[chosen].astype(np.float64)
+    return chosen, values / values.max(axis=1, keepdims=True)

@@ -42,38 +42,24 @@ Progress = Callable[[], object]  # called once after each image
 
 @dataclass(frozen=True, eq=False)
 class CaptureSource:
-    """An opened capture: lights and facts of images loaded, pixels still on disk.
-
-    Args:
-        light_directions: (F, 3) float64, unit; x right, y up, z to the camera. They mean nothing
-            where find_lights is given.
-        light_intensities: (F, 3) float64, RGB; ones where no file gives them.
-        intensities_known: whether a file or the user gives the intensities.
-        intensities_measured: whether a file gives the intensities.
-        white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
-        light_frame: the frame of the light file, in which the directions are no longer.
-        automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
-        lamps: what is known of near lamps, or None.
-        window: the part of the images that is read. All masks but those in files have its size.
-        find_lights: finds the lights from the images; None where files give them.
-        stamp: JSON values that change when a file that is read for the capture, or the given white level, does. They
-            are older than what was read: a file that changed meanwhile has another stamp the next time.
-    """
+    """An opened capture: lights and facts of images loaded, pixels still on disk."""
 
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
-    light_directions: NDArray[np.float64]
-    light_intensities: NDArray[np.float64]
+    light_directions: NDArray[np.float64]  # (F, 3), unit; x right, y up, z to the camera. See find_lights
+    light_intensities: NDArray[np.float64]  # (F, 3), RGB; ones where no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
-    white_level: float | None = None
-    automatic_mask: NDArray[np.bool_] | None = None
-    intensities_known: bool = True
-    intensities_measured: bool = True
-    light_frame: LightFrame = USUAL_FRAME
-    lamps: LampFiles | None = None
-    window: Window = WHOLE
-    find_lights: LightFinder | None = None
+    white_level: float | None = None  # stored value from which an observation counts as saturated; None to find it
+    automatic_mask: NDArray[np.bool_] | None = None  # (H, W), made from the images in place of a file; see find_mask
+    intensities_known: bool = True  # whether a file or the user gives the intensities
+    intensities_measured: bool = True  # whether a file gives the intensities
+    light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
+    lamps: LampFiles | None = None  # what is known of near lamps, or None
+    window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
+    find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
+    # JSON values that change when a file that is read for the capture, or the given white level, does. They are older
+    # than what was read: a file that changed meanwhile has another stamp the next time
     stamp: tuple[Any, ...] = ()
 
     @property
@@ -81,11 +67,7 @@ class CaptureSource:
         return len(self.light_directions)
 
     def read(
-        self,
-        light_indices: Sequence[int] | None = None,
-        progress: Progress | None = None,
-        *,
-        as_stored: bool = False,
+        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None, *, as_stored: bool = False
     ) -> Capture:
         """Return the capture under the chosen lights (None for all), in the order given.
 
@@ -115,10 +97,7 @@ class CaptureSource:
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
-            whole = self.window.whole(mask)
-            ground_truth, upside_down = read_ground_truth(
-                self.files.ground_truth, (whole.shape[0], whole.shape[1]), whole
-            )
+            ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
         images = self.read_pixels(mask, indices, lambda pixels: pixels)
         observations, saturation, warnings = collect_observations(
@@ -147,8 +126,7 @@ class CaptureSource:
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
-        Raises:
-            InputError: no object stands out, or an image cannot be read.
+        Raises InputError where no object stands out, or an image cannot be read.
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
@@ -179,11 +157,9 @@ class CaptureSource:
             mask = read_mask(files.mask, expected)
         mask = self.window.of(mask)
         if not mask.any():
-            raise InputError(
-                "the mask has no pixel in the part that is read",
-                path=files.mask or files.folder,
-                hint="Choose another --crop, or a larger --scale",
-            )
+            problem = "the mask has no pixel in the part that is read"
+            hint = "Choose another --crop, or a larger --scale"
+            raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
@@ -197,22 +173,14 @@ class CaptureSource:
         check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
 
-    def lamps_over(self, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
-        """Return all lamps over a mask (H, W), or over one of every step-th row and column; None for none."""
-        if self.lamps is None:
-            return None
-        equal = not self.intensities_measured
-        return self.lamps.over(self.light_directions, mask, self.window, equal=equal, frame=self.light_frame, step=step)
-
     def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
-        Raises:
-            InputError: a lamp would be inside the object.
+        Raises InputError where a lamp would be inside the object.
         """
         if self.lamps is None:
             return None, []
-        lamps = self.lamps_over(mask)
+        lamps = self.lamps.over(self, mask)
         if lamps is None or not self.lamps.used:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
@@ -222,8 +190,7 @@ class CaptureSource:
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
-        Raises:
-            InputError: an image cannot be read, or does not have the size of the mask.
+        Raises InputError where an image cannot be read, or does not have the size of the mask.
         """
         reader = PixelReader(self.radiometry, mask, len(self.facts), self.window)
         like = self.files.images[indices[0]].name

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.capture.formats.text import read_text
-from splinecli.capture.paths import check_file, is_substitution
-from splinecli.errors import InputError
+from splinecli.capture.paths import check_file, is_substitution, reading
 from splinecli.system.files import file_sha256
 
 if TYPE_CHECKING:
@@ -39,12 +38,10 @@ def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence
 def stamp_content(path: Path) -> Any:
     """Return the SHA-256 of a file, or the path, size and time of change of a very large one. Raises InputError."""
     check_file(path, "a file", pipe=True)
-    try:
-        if is_substitution(path):
-            return hashlib.sha256(read_text(path)).hexdigest()
+    if is_substitution(path):
+        return hashlib.sha256(read_text(path)).hexdigest()
+    with reading(path):
         return file_sha256(path) if path.stat().st_size <= LARGEST_HASHED else _path_size_and_time(path)
-    except OSError as error:
-        raise _unreadable(path, error) from None
 
 
 def digest(stamp: Sequence[Any]) -> str:
@@ -53,12 +50,6 @@ def digest(stamp: Sequence[Any]) -> str:
 
 
 def _path_size_and_time(path: Path) -> tuple[str, int, int]:
-    try:
+    with reading(path):
         status = path.stat()
         return str(path.resolve()), status.st_size, status.st_mtime_ns
-    except OSError as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: Path, error: OSError) -> InputError:
-    return InputError(f"the file cannot be read ({error.strerror})", path=path)

@@ -40,28 +40,19 @@ class StoredCapture:
     def find_lights(self, find: LightFinder) -> StoredCapture:
         """Return the capture under lights that are found from these observations.
 
-        Raises:
-            InputError: the images do not tell the lights, or the lights that are found cannot give normals.
+        Raises InputError where the images do not tell the lights, or those that are found cannot give normals.
         """
         capture = self.capture
         try:
             found = find(capture.observations, capture.mask, self.intensities_known)
         except InputError as error:
             raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
-        warning = estimated_lights(found.errors_deg)
-        capture = replace(
-            capture,
-            light_directions=found.directions,
-            light_errors_deg=found.errors_deg,
-            warnings=(*capture.warnings, warning),
-        )
+        warnings, directions = (*capture.warnings, estimated_lights(found.errors_deg)), found.directions
+        capture = replace(capture, light_directions=directions, light_errors_deg=found.errors_deg, warnings=warnings)
         return replace(self, capture=capture, found_intensities=found.intensities)
 
     def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
-        """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights.
-
-        The warnings stay those of all lights.
-        """
+        """Return the capture under some of its lights, with arrays of its own, but the warnings of all lights."""
         capture, saturation = self.capture.choose_lights(positions), self.saturation.choose_images(positions)
         if saturation.white_level != capture.white_level:
             capture = replace(capture, white_level=saturation.white_level)
@@ -69,11 +60,7 @@ class StoredCapture:
         return replace(self, capture=capture, saturation=saturation, found_intensities=found)
 
     def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
-        """Return the capture with some of its pixels, with arrays of its own.
-
-        Args:
-            rows: rows of the observations, in rising order.
-        """
+        """Return the capture with some of its pixels, rows of the observations that rise, with arrays of its own."""
         return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:

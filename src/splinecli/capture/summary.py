@@ -42,15 +42,14 @@ class CaptureSummary:
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
-    sample: Sample | None = None  # some of the pixels of all images, on a grid; None where images have different sizes
-    closeup: Sample | None = None  # every pixel of the middle, or None
-    lamp_warnings: tuple[CaptureWarning, ...] = ()  # about near lamps over this mask
+    # some of the pixels of all images, on a grid, and every pixel of the middle; None where images have different sizes
+    samples: tuple[Sample, Sample] | None
+    lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
 
     @property
     def axis_angles_deg(self) -> NDArray[np.float64]:
         """Angles (F,) between the lights and the camera axis."""
-        degrees: NDArray[np.float64] = np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1)))
-        return degrees
+        return np.asarray(np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1))))
 
     def warnings(self) -> list[CaptureWarning]:
         """Return warnings of faults that reduce accuracy."""
@@ -89,9 +88,7 @@ class CaptureSummary:
 def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
-    Raises:
-        InputError: an image cannot be read, the mask, the ambient image or a flat field does not fit, or a lamp would
-            be inside the object.
+    Raises InputError where an image cannot be read or does not fit, or a lamp would be inside the object.
     """
     sizes = [facts.size[0][:2] for facts in source.facts]
     shape = sizes[0]
@@ -122,20 +119,12 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
     saturation = Saturation(n_pixels, tuple(found), source.white_level)
     for index, n_saturated in zip(fitting, saturation.n_saturated.tolist(), strict=True):
         images[index] = replace(images[index], saturated=n_saturated / max(n_pixels, 1))
-    level = saturation.white_level
-    sample = closeup = None
+    level, samples = saturation.white_level, None
     if len(fitting) == len(sizes):
         sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
-        closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
-    return CaptureSummary(
-        source,
-        tuple(_relative_to(level, images[index]) for index in range(len(sizes))),
-        n_pixels,
-        level,
-        sample,
-        closeup,
-        tuple(source.near_lamps(mask)[1]),
-    )
+        samples = sample, Sample(observations[inside[taken]], mask[seen_closely], 1)
+    relative = tuple(_relative_to(level, images[index]) for index in range(len(sizes)))
+    return CaptureSummary(source, relative, n_pixels, level, samples, source.near_lamps(mask)[1])
 
 
 def _summarise(pixels: StoredPixels, size: tuple[int, ...]) -> ImageSummary:

@@ -71,10 +71,9 @@ class Window:
         if self.box is not None:
             left, top, box_width, box_height = self.box
             if left + box_width > width or top + box_height > height:
-                raise InputError(
-                    f"--crop {','.join(map(str, self.box))} is not inside the image of {width} x {height} pixels",
-                    path=image.path,
-                )
+                crop = ",".join(map(str, self.box))
+                problem = f"--crop {crop} is not inside the image of {width} x {height} pixels"
+                raise InputError(problem, path=image.path)
         return replace(self, shape=shape)
 
 
@@ -88,10 +87,8 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
         found = _CROP.fullmatch(crop.replace(" ", ""))
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
-            raise UsageError(
-                f"--crop is {crop!r}; expected X,Y,W,H: the left upper corner and the size in pixels",
-                hint="Such as --crop 1000,500,800,600",
-            )
+            problem = f"--crop is {crop!r}; expected X,Y,W,H: the left upper corner and the size in pixels"
+            raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
     step = 1
     if scale is not None:
         found = _SCALE.fullmatch(scale.replace(" ", ""))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from typer import Argument, Option
 
 from splinecli.capture.capture_warnings import PROBABLY_WRONG
-from splinecli.capture.formats.text import is_number
+from splinecli.capture.formats.text import to_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.failures import printed_documents
@@ -175,7 +175,7 @@ def _split_maps(text: str | None) -> dict[str, Any]:
         name, colon, scale = (part.strip() for part in item.partition(":"))
         names.append(name)
         if colon:
-            if name not in SCALED_MAPS or not is_number(scale):
+            if name not in SCALED_MAPS or to_number(scale) is None:
                 expected = " or ".join(f"{name}:NUMBER" for name in SCALED_MAPS)
                 raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
             fields[f"{name}_scale"] = float(scale)

@@ -1,6 +1,6 @@
 """The checks of a capture's lights and images against each other, which `infer` and `info` make, in their order."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
-from splinecli.diagnosis.evidence import Evidence, StatedLights
+from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
@@ -31,20 +31,20 @@ that fit best leave less than this share of it. Right captures of flat metal lea
 
 _MOST_NAMED = 4  # shifted images in a sentence
 
-Check = Callable[[Evidence], list[CaptureWarning]]
+Check = Callable[[Evidence], Iterable[CaptureWarning]]
 
 
-def shifted_images(seen: Evidence) -> list[CaptureWarning]:
-    shifts, names = seen.shifts, seen.lights.names
+def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
+    shifts, names = seen.shifts, seen.names
     if not shifts:
-        return []
+        return
     named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
     text = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
         f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
-    return [CaptureWarning(codes.IMAGES_SHIFTED, text)]
+    yield CaptureWarning(codes.IMAGES_SHIFTED, text)
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
@@ -54,58 +54,40 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         return []
     how = "" if odd.brightness is None else f" and is {odd.brightness:.2f} times as bright as they predict"
     text = (
-        f"{seen.lights.names[odd.place]} contradicts the other images{how}: without it, {100 * odd.left:.0f} % of what"
+        f"{seen.names[odd.place]} contradicts the other images{how}: without it, {100 * odd.left:.0f} % of what"
         " the lights cannot explain is left. Its lamp was moved or failed, its exposure differs, or a shadow fell on"
         " the object. Photograph it again, or leave it out."
     )
     return [CaptureWarning(codes.IMAGE_ODD, text)]
 
 
-def doubted_lights(seen: Evidence) -> list[CaptureWarning]:
-    return light_warnings(seen.light_check, seen.lights.origin, seen.lights.frame, strict=seen.strict)
+def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
+    if seen.background > MOST_BACKGROUND:
+        text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
+        text += " background mean nothing. Add --auto-mask, or give a mask."
+        yield CaptureWarning(codes.NO_MASK, text)
 
 
-def missing_mask(seen: Evidence) -> list[CaptureWarning]:
-    if seen.background <= MOST_BACKGROUND:
-        return []
-    text = (
-        f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
-        " background mean nothing. Add --auto-mask, or give a mask."
-    )
-    return [CaptureWarning(codes.NO_MASK, text)]
-
-
-def crowded_lights(seen: Evidence) -> list[CaptureWarning]:
+def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread >= SMALLEST_SPREAD:
-        return []
-    where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
-    text = (
-        f"The lights {where}, so noise and small errors of their directions grow about {1 / max(spread, 1e-3):.0f}"
-        " times in the normals. Add lights from other sides."
-    )
-    return [CaptureWarning(codes.LIGHTS_CROWDED, text)]
+    if spread < SMALLEST_SPREAD:
+        where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
+        times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
+        text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
+        yield CaptureWarning(codes.LIGHTS_CROWDED, text)
 
 
-def same_images(seen: Evidence) -> list[CaptureWarning]:
-    pairs = repeated_images(seen.sample.observations)
-    if not pairs:
-        return []
-    first, second = (seen.lights.names[place] for place in pairs[0])
-    more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
-    text = (
-        f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by its"
-        " own photograph."
-    )
-    return [CaptureWarning(codes.REPEATED_IMAGES, text)]
+def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
+    if pairs := repeated_images(seen.sample.observations):
+        first, second = (seen.names[place] for place in pairs[0])
+        more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
+        text = f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by"
+        yield CaptureWarning(codes.REPEATED_IMAGES, f"{text} its own photograph.")
 
 
 def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     """Suggest to refine the lights where this makes them fit much better."""
-    if seen.lights.has_positions:
-        return []
-    refined = would_refine(seen.observations, seen.factors, seen.directions)
-    if refined is None:
+    if seen.has_positions or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None:
         return []
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (
@@ -117,9 +99,9 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
 
 def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
     """Warn of intensities that are unequal, but that the images do not determine."""
-    if seen.lights.has_positions and seen.lights.lamps is None:
+    if seen.has_positions and seen.lamps is None:
         return []  # near lamps that count as distant look unequal
-    if seen.lights.intensities_known or seen.factors is None:
+    if seen.intensities_known or seen.factors is None:
         return []
     equal, free = (
         float(replace(seen.factors, intensities_known=known).misfits(seen.directions[None])[0])
@@ -146,13 +128,13 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (shifted_images, frozenset()),
     (odd_image, frozenset()),
-    (doubted_lights, frozenset()),
+    (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), frozenset()),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),
     (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
-    (lambda seen: encoded_values(seen.evened, seen.directions) if seen.lights.linear else [], DOUBTED),
-    (lambda seen: [] if seen.lights.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),
+    (lambda seen: encoded_values(seen.evened, seen.directions) if seen.linear else [], DOUBTED),
+    (lambda seen: [] if seen.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),
     (rough_lights, EXPLAINED | {codes.LAMPS_NEAR}),
     (unequal_intensities, EXPLAINED | {codes.LAMPS_NEAR}),
 )
@@ -163,17 +145,27 @@ WITHOUT_LIGHTS = (shifted_images, missing_mask, same_images)
 
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source; see check_sample."""
-    sample, closeup = _samples(capture)
-    lights = StatedLights.of_source(source, sample, capture.light_indices)
-    return check_sample(lights, sample, closeup, truth=capture.ground_truth, strict=strict)[1]
+    """Return warnings about a capture that was read from this source; see check_evidence."""
+    samples, truth = _samples(capture), capture.ground_truth
+    return check_evidence(Evidence.of_source(source, samples, capture.light_indices, truth=truth, strict=strict))[1]
 
 
 def check_arrays(capture: Capture, *, intensities_measured: bool) -> list[CaptureWarning]:
-    """Return warnings about a capture that was made from arrays; see check_sample."""
-    sample, closeup = _samples(capture)
-    lights = StatedLights.of_arrays(capture, sample, intensities_measured=intensities_measured)
-    return check_sample(lights, sample, closeup)[1]
+    """Return warnings about a capture that was made from arrays; see check_evidence."""
+    (sample, closeup), lamps, n_lights = _samples(capture), capture.lamps, capture.n_lights
+    seen = Evidence(
+        [f"images[{index}]" for index in range(n_lights)],
+        capture.light_directions,
+        range(n_lights),
+        sample,
+        closeup,
+        intensities_measured,
+        intensities_measured,
+        lamps=None if lamps is None else lamps.within(0, 0, sample.step, lamps.camera_matrix),
+        has_positions=lamps is not None,
+        found=capture.light_errors_deg is not None,
+    )
+    return check_evidence(seen)[1]
 
 
 def _samples(capture: Capture) -> tuple[Sample, Sample]:
@@ -184,30 +176,17 @@ def _samples(capture: Capture) -> tuple[Sample, Sample]:
     return sample, take_closeup(capture.observations, capture.mask)
 
 
-def check_sample(
-    lights: StatedLights,
-    sample: Sample,
-    closeup: Sample,
-    *,
-    truth: NDArray[np.floating] | None = None,
-    strict: bool = False,
-) -> tuple[LightCheck | None, list[CaptureWarning]]:
-    """Return what a sample and a closeup of some images say about their lights (None if found in them), and warnings.
-
-    Args:
-        sample: its observations are not divided by estimated intensities.
-        truth: (H, W, 3), the ground truth of the capture.
-        strict: also warn of what the images do not tell.
-    """
-    (sample, background), (closeup, _) = leave_out_background(sample), leave_out_background(closeup)
-    seen = Evidence(lights, sample, closeup, background, truth, strict)
+def check_evidence(seen: Evidence) -> tuple[LightCheck | None, list[CaptureWarning]]:
+    """Return what images without dark background say about their lights (None if found in them), and warnings."""
+    (sample, background), (closeup, _) = leave_out_background(seen.sample), leave_out_background(seen.closeup)
+    seen = replace(seen, sample=sample, closeup=closeup, background=background)
     warnings: list[CaptureWarning] = []
     for check, unless in CHECKS:
-        if lights.found and check not in WITHOUT_LIGHTS:
+        if seen.found and check not in WITHOUT_LIGHTS:
             continue
         if unless.isdisjoint(warning.code for warning in warnings):
             warnings += check(seen)
-    return None if lights.found else seen.light_check, warnings
+    return None if seen.found else seen.light_check, warnings
 
 
 def light_spread(light_directions: NDArray[np.float64]) -> tuple[float, bool]:

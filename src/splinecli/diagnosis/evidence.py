@@ -1,4 +1,4 @@
-"""What is stated about a capture's lights, and what its pixels show: what the checks see."""
+"""What files or arguments say about a capture's lights, and what its pixels show: what the checks see."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import Capture, CaptureSource
+from splinecli.capture import CaptureSource
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -21,74 +21,60 @@ from splinecli.maths.solve_3x3 import solve_each
 
 
 @dataclass(frozen=True, eq=False)
-class StatedLights:
-    """What files or arguments say about the lights of F images."""
+class Evidence:
+    """F images and their lights as the checks see them; what several checks need is found once."""
 
     names: Sequence[str]
-    directions: NDArray[np.float64]  # (N, 3), all lights of the file, in its order
+    all_directions: NDArray[np.float64]  # (N, 3), all lights of the file, in its order
     indices: Sequence[int]  # (F,), those of the images
+    sample: Sample  # not divided by estimated intensities, as the closeup
+    closeup: Sample
     intensities_measured: bool  # whether the intensities are given
     intensities_known: bool  # whether they are given, or the user says that they are equal
-    # all near lamps, over the grid of the sample that is checked; None if the lights count as distant
-    lamps: NearLamps | None = None
+    lamps: NearLamps | None = None  # all near lamps, over the grid of the sample; None if the lights count as distant
     has_positions: bool = False  # whether positions of lamps are known
     found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
     linear: bool = True  # whether the values of the images are taken as linear
+    truth: NDArray[np.floating] | None = None  # (H, W, 3), the ground truth of the whole images, or None
+    strict: bool = False  # also warn of what the images do not tell
+    background: float = 0.0  # the share of dark background that was left out of the sample
 
     @classmethod
-    def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
-        """Return what the files of a capture say about the images with these indices."""
-        used = source.lamps is not None and source.lamps.used
+    def of_source(
+        cls,
+        source: CaptureSource,
+        samples: tuple[Sample, Sample],
+        indices: Sequence[int],
+        *,
+        truth: NDArray[np.floating] | None = None,
+        strict: bool = False,
+    ) -> Evidence:
+        """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
+        (sample, closeup), lamps = samples, source.lamps
         return cls(
-            names=[source.files.images[index].name for index in indices],
-            directions=source.light_directions,
-            indices=indices,
-            intensities_measured=source.intensities_measured,
-            intensities_known=source.intensities_known,
-            lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
-            has_positions=source.lamps is not None,
+            [source.files.images[index].name for index in indices],
+            source.light_directions,
+            indices,
+            sample,
+            closeup,
+            source.intensities_measured,
+            source.intensities_known,
+            lamps=lamps.over(source, sample.mask, step=sample.step) if lamps is not None and lamps.used else None,
+            has_positions=lamps is not None,
             found=source.find_lights is not None,
             origin=source.files.light_directions or Path("light_directions"),
             frame=source.light_frame,
             linear=source.radiometry.curve == 1,
+            truth=truth,
+            strict=strict,
         )
-
-    @classmethod
-    def of_arrays(cls, capture: Capture, sample: Sample, *, intensities_measured: bool) -> StatedLights:
-        """Return what the arguments of splinecli.estimate_normals say."""
-        lamps = capture.lamps
-        if lamps is not None:
-            lamps = lamps.within(0, 0, sample.step, lamps.camera_matrix)
-        return cls(
-            names=[f"images[{index}]" for index in range(capture.n_lights)],
-            directions=capture.light_directions,
-            indices=range(capture.n_lights),
-            intensities_measured=intensities_measured,
-            intensities_known=intensities_measured,
-            lamps=lamps,
-            has_positions=lamps is not None,
-            found=capture.light_errors_deg is not None,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """A capture as the checks see it; what several of them need is found once."""
-
-    lights: StatedLights
-    # sample, closeup: without dark background, not divided by estimated intensities
-    sample: Sample
-    closeup: Sample
-    background: float = 0.0  # its share
-    truth: NDArray[np.floating] | None = None  # (H, W, 3), the ground truth of the whole images, or None
-    strict: bool = False  # also warn of what the images do not tell
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:
         """The directions (F, 3) of the images' lights."""
-        return self.lights.directions[list(self.lights.indices)]
+        return self.all_directions[list(self.indices)]
 
     @cached_property
     def observations(self) -> NDArray[np.floating]:
@@ -97,9 +83,9 @@ class Evidence:
         The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as
         the misfit of lights in a wrong order, stays.
         """
-        if self.lights.lamps is None:
+        if self.lamps is None:
             return self.sample.observations
-        lamps = self.lights.lamps.choose_lights(self.lights.indices)
+        lamps = self.lamps.choose_lights(self.indices)
         near, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
         observations = self.sample.observations / strengths
         scaled_normals = solve_each(observations, near)
@@ -107,7 +93,7 @@ class Evidence:
 
     @cached_property
     def factors(self) -> Factors | None:
-        return find_factors(self.observations, intensities_known=self.lights.intensities_measured)
+        return find_factors(self.observations, intensities_known=self.intensities_measured)
 
     @cached_property
     def evened(self) -> Sample:
@@ -120,9 +106,8 @@ class Evidence:
 
     @cached_property
     def light_check(self) -> LightCheck:
-        stated = self.lights
         return check_lights(
-            self.observations, self.sample.mask, stated.directions, stated.indices, stated.names, self.factors
+            self.observations, self.sample.mask, self.all_directions, self.indices, self.names, self.factors
         )
 
     @cached_property

@@ -13,7 +13,7 @@ from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_rows, shade
+from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_values, shade
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import rough_normals
 from splinecli.maths.normals import angle_between_deg, unit
@@ -83,11 +83,9 @@ def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
 def check_ground_truth(
     sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating] | None
 ) -> list[CaptureWarning]:
-    """Return a warning if a ground truth (H, W, 3) fits a sample only in another frame, or an empty list.
+    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame.
 
-    Args:
-        light_directions: (F, 3).
-        truth: of the whole images; unit normals, or zero where there is no ground truth. None gives no warning.
+    It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
     """
     if truth is None:
         return []
@@ -125,10 +123,9 @@ def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float
         return None
     rows, columns = (places[chosen] for places in np.nonzero(sample.mask))
     width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
-    shape = (sample.mask.shape[0], sample.mask.shape[1])
     ratios, lights = [], []
     for widths in DISTANCES:
-        lamps = NearLamps.of(light_directions * widths * width, 1.0, shape, equal=True)
+        lamps = NearLamps.of(light_directions * widths * width, 1.0, sample.mask.shape, equal=True)
         directions, strengths = lamps.light_at(lamps.plane_points(rows, columns))
         lights.append(np.asarray(directions * strengths[..., None], np.float64))
         ratios.append(float(np.sqrt(np.prod(_misfits(values, lights[-1]) / before))))
@@ -150,20 +147,17 @@ def _choose(observations: NDArray[np.floating]) -> tuple[NDArray[np.intp], Array
     none = np.zeros(0, np.intp), np.zeros((0, n_lights))
     if n_lights < MIN_LIGHTS or len(observations) < _MIN_PIXELS:
         return none
-    chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
-    values = observations[chosen].astype(np.float64).clip(min=0)
-    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    chosen, values = lit_values(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+    values = values.clip(min=0)
     # Three unknowns need more than three lit observations to leave a residual.
     enough = (values > _SHADOW_SHARE).sum(axis=1) >= 5
     return (chosen[enough], values[enough]) if enough.sum() >= _MIN_PIXELS else none
 
 
 def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float = _SHADOW_SHARE) -> Array:
-    """Return mean and median |difference| of lit values (p, F) from a robust fit of I^gamma = l . b.
+    """Return mean and median |difference| of lit values (p, F), above `shadow`, from a robust fit of I^gamma = l . b.
 
-    Args:
-        lights: (F, 3) or (p, F, 3), of any length.
-        shadow: values up to this do not count.
+    The lights (F, 3) or (p, F, 3) have any length.
     """
     lit = values > shadow
     # The slope of the stored value over the linear one, so that both readings have the same errors.

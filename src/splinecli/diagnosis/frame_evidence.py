@@ -30,9 +30,7 @@ class RoughNormals:
 
     normals: Array  # (h, w, 3), unit in the mask, zero outside
     mask: NDArray[np.bool_]  # (h, w)
-    # (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of the rim; zero
-    # elsewhere
-    outward: Array
+    outward: Array  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
 
     @property
     def rim_steepness(self) -> float:
@@ -50,9 +48,7 @@ class RoughNormals:
         from scipy.ndimage import binary_erosion
 
         z = np.maximum(self.normals[..., 2], _LOWEST_Z)
-        p, q = -self.normals[..., 0] / z, -self.normals[..., 1] / z
-        p_x, p_y = _derivatives(p)
-        q_x, q_y = _derivatives(q)
+        (p_x, p_y), (q_x, q_y) = (_derivatives(-self.normals[..., axis] / z) for axis in (0, 1))
         inside = binary_erosion(self.mask & (self.normals[..., 2] > _LOWEST_Z))
         if inside.sum() < 50:
             return float("nan")
@@ -72,11 +68,7 @@ class RoughNormals:
 
 
 def rough_normals(observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]) -> RoughNormals:
-    """Return smoothed normals of a fit of least absolute deviations.
-
-    Args:
-        observations: (P, F). light_directions: (F, 3). mask: (H, W) with P pixels.
-    """
+    """Return smoothed normals of a fit of least absolute deviations to observations (P, F) of a mask (H, W)."""
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)

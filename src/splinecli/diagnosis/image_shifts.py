@@ -19,9 +19,7 @@ LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
 """A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
 images and more, a polished metal reached 0.44 and 0.17."""
 
-LEAST_SHIFT = 0.8
-"""The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel."""
-
+LEAST_SHIFT = 0.8  # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
 LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
 LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
 _MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
@@ -63,13 +61,10 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
 
 
 def _predictions(values: NDArray[np.float32], predictors: Sequence[int]) -> Iterator[NDArray[np.float32]]:
-    """Yield for each image of (P, F) what the three strongest factors of the predictors explain of it, (P,).
-
-    No image predicts itself.
-    """
+    """Yield for each image of (P, F) what the three strongest factors of the predictors explain of it, (P,)."""
     products = values.T @ values
     for place in range(len(products)):
-        others = [other for other in predictors if other != place]
+        others = [other for other in predictors if other != place]  # no image predicts itself
         strengths, directions = np.linalg.eigh(products[np.ix_(others, others)])
         weights = np.zeros((len(products), 3), np.float32)
         weights[others] = directions[:, -3:] / np.sqrt(np.maximum(strengths[-3:], 1e-12))
@@ -78,10 +73,7 @@ def _predictions(values: NDArray[np.float32], predictors: Sequence[int]) -> Iter
 
 
 def _shift(
-    image: NDArray[np.float32],
-    predicted: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    inner: NDArray[np.float32],
+    image: NDArray[np.float32], predicted: NDArray[np.float32], mask: NDArray[np.bool_], inner: NDArray[np.float32]
 ) -> tuple[int, int] | None:
     """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images agrees; or None."""
     detail, expected = _detail(image, mask), _detail(predicted, mask)
@@ -94,6 +86,7 @@ def _shift(
     around = correlations[LARGEST + down - 1 :, LARGEST + right - 1 :][:3, :3]
     if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < LEAST_SHIFT:
         return None
+    # A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
     for half in _halves(inner):
         of_half = _peak(_correlations(detail, expected, half))
         if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
@@ -114,16 +107,12 @@ def _correlations(
 
 
 def _peak(correlations: NDArray[np.float32]) -> tuple[int, int]:
-    """Return the shift (right, down) of the largest correlation."""
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
     return int(right) - LARGEST, int(down) - LARGEST
 
 
 def _halves(inner: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
-    """Yield the left, right, upper and lower half of the pixels of a map (H, W).
-
-    A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
-    """
+    """Yield the left, right, upper and lower half of the pixels of a map (H, W)."""
     for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
         yield inner * (places <= middle)
         yield inner * (places > middle)

@@ -28,9 +28,7 @@ CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 
 TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
 NEAR = 0.1  # candidates whose advantages differ by less are near equals
-
-LOWEST_CURL = 0.1
-"""Curls below this are noise. On a cap of a sphere, other frames give little more."""
+LOWEST_CURL = 0.1  # Curls below this are noise. On a cap of a sphere, other frames give little more.
 
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
@@ -56,8 +54,8 @@ class LightCheck:
     candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
     # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
     order: str | None
-    # given_misfit, order_misfit: distances between the images and the lights in the given order and in the better one,
-    # as shares of the median of random orders; NaN where there are too few lights
+    # distances between the images and the lights in the given order and in the better one, as shares of the median of
+    # random orders; NaN where there are too few lights
     given_misfit: float
     order_misfit: float
     # the reading that gives better normals; None if there is none. Its frame is relative to the given one
@@ -155,10 +153,7 @@ def _check_frame_and_order(
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    """Return the best candidate, if it is better than the given one.
-
-    Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
-    """
+    # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]
     preferred = [candidate for candidate in near if (candidate.frame is None) == in_order]
@@ -176,8 +171,7 @@ def light_warnings(
 ) -> list[CaptureWarning]:
     """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
 
-    Args:
-        strict: also warn of what the images do not tell. It says nothing about most reliefs without an outline.
+    If `strict`, also warn of what the images do not tell, as they do not of most reliefs without an outline.
     """
     warnings = []
     if check.order is not None:
@@ -248,13 +242,8 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
 
     Frames come first, then orders, which are judged by their misfit alone.
     """
-    readings = [
-        (candidate.name, (check.order_misfit, candidate.curl, candidate.rim, candidate.advantage))
-        for candidate in check.candidates
-    ]
-    readings += [(words, (misfit, np.nan, np.nan, np.nan)) for words, misfit in check.tried]
-    rows = []
-    for words, values in readings:
-        rounded = [round(value, 3) if np.isfinite(value) else None for value in values]
-        rows.append(dict(zip(("reading", "misfit", "curl", "rim", "advantage"), (words, *rounded), strict=True)))
-    return rows
+    readings = [(each.name, check.order_misfit, each.curl, each.rim, each.advantage) for each in check.candidates]
+    readings += [(words, misfit, np.nan, np.nan, np.nan) for words, misfit in check.tried]
+    names = ("misfit", "curl", "rim", "advantage")
+    rounded = ((words, [round(v, 3) if np.isfinite(v) else None for v in values]) for words, *values in readings)
+    return [{"reading": words, **dict(zip(names, values, strict=True))} for words, values in rounded]

@@ -84,16 +84,11 @@ class Turn(NamedTuple):
 class LightOrder:
     """The order of lights that fits best."""
 
-    # in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found
-    order: str | None
+    order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
     lights: Array  # (F, 3), in this order
-    # (F,), those that fit these lights best; ones where only known ones tell the order. They make the normals of metals
-    # better
-    intensities: Array
-    # given_misfit, misfit: of the given order and of this one, as shares of random orders'; NaN where there are too few
-    # lights
-    given_misfit: float = np.nan
-    misfit: float = np.nan
+    intensities: Array  # (F,), those that fit these lights best, for metals; ones where only known ones tell the order
+    given_misfit: float = np.nan  # as a share of random orders'; NaN where there are too few lights
+    misfit: float = np.nan  # that of this order
     plausible: bool = True  # whether the lights fit well enough for the normals to tell an outline
     tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its misfit as a share of random orders'
     turns: tuple[Turn, ...] = ()  # shifts that fit as well. They turn a regular ring of lights
@@ -202,10 +197,8 @@ def _free_if_possible(factors: Factors, lights: Array) -> tuple[Factors, Array]:
 
 
 def _fits_like_random(observations: NDArray[np.floating], factors: Factors, lights: Array) -> bool:
-    """Return whether lights fit the pixels little better than in random orders.
-
-    The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
-    """
+    """Return whether lights fit the pixels little better than in random orders."""
+    # The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
     values = sample_pixels(observations)
     values = values[:: max(1, len(values) // _FITTED_PIXELS)]
     rng = np.random.default_rng(1)
@@ -227,7 +220,6 @@ def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[T
 
 
 def _shift_words(order: int, n_lights: int) -> str:
-    """Return words for a row of shifted_orders."""
     steps = order % n_lights
     if order < n_lights:
         return f"if image 1 belongs to light {steps + 1}, image 2 to the next, and so on"

@@ -39,8 +39,7 @@ class OddImage:
 
     place: int
     left: float  # what is left without it of the misfit, or of the residual of the factors, as a share of that of all
-    # of the image, as a share of what its light would give; None where brightness is not its fault, or the intensity of
-    # the light is unknown
+    # as a share of what its light would give; None where it is not the fault, or the light's intensity is unknown
     brightness: float | None = None
 
 

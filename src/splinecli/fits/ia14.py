@@ -24,11 +24,7 @@ def solve(observations: Tensor, light_directions: Tensor, valid: Tensor | None =
 
 
 def fit(
-    observations: Tensor,
-    light_directions: Tensor,
-    valid: Tensor | None = None,
-    *,
-    prior_weight: float = 0.01,
+    observations: Tensor, light_directions: Tensor, valid: Tensor | None = None, *, prior_weight: float = 0.01
 ) -> tuple[Tensor, Tensor]:
     """Return normals (P, 3) of any length, and the polynomial's increments (P, N1, N2 + 1), which are not negative.
 
@@ -70,12 +66,8 @@ def fit(
     mean = basis.sum(dim=1) / used.sum(dim=1, keepdim=True).clamp(min=1)
     # The sum is homogeneous of degree 2 in d, apart from the condition mean'd = 1. Adding (mean'd - 1)^2 to the sum
     # instead of the condition changes the length of the optimum but not its direction.
-    hessian = (
-        residual.mT @ residual
-        + prior_weight / size * (eye - 1 / size)
-        + _RIDGE * eye
-        + mean[:, :, None] * mean[:, None, :]
-    )
+    prior = prior_weight / size * (eye - 1 / size)
+    hessian = residual.mT @ residual + prior + _RIDGE * eye + mean[:, :, None] * mean[:, None, :]
     increments = minimise_nonnegative(hessian, mean)
     normals = (normal_of @ increments[..., None])[..., 0]
     # Restore the length for which the mean of g is 1. Zero stays zero.
@@ -139,8 +131,7 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
         fewer = wrong_count < fewest_wrong
         fewest_wrong = torch.where(fewer, wrong_count, fewest_wrong)
         patience = torch.where(fewer, 3, patience - 1)
-        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last one,
-        # which cannot.
+        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last, which cannot.
         last = torch.where(wrong, position, -1).amax(dim=1, keepdim=True)
         free = free ^ torch.where(patience[:, None] < 0, wrong & (position == last), wrong)
     return torch.where(free, x, 0).clamp(min=0)

@@ -17,8 +17,7 @@ SHADOW_SHARE = 0.1
 SMALLEST_VARIANCE = 1e-6
 """Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best."""
 
-ITERATIONS = 20
-"""Further iterations change the normals of real captures by only some hundredths of a degree on average."""
+ITERATIONS = 20  # further iterations change the normals of real captures by only some hundredths of a degree on average
 
 
 def solve(

@@ -7,8 +7,7 @@ from splinecli.fits.weighted_least_squares import weighted_least_squares
 from splinecli.maths.observation_map import dot
 
 ITERATIONS = 50
-SMALLEST_RESIDUAL = 1e-7
-"""Weights stop growing below this residual, for a largest observation of 1."""
+SMALLEST_RESIDUAL = 1e-7  # weights stop growing below this residual, for a largest observation of 1
 
 
 def solve(observations: Tensor, light_directions: Tensor) -> Tensor:

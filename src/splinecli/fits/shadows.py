@@ -8,8 +8,7 @@ UNSHADED = 0.6
 observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
 a metal all others are dark beside the highlight."""
 
-FEWEST_LIT = 3
-"""Number of brightest observations that never count as shadows, because a normal needs three."""
+FEWEST_LIT = 3  # number of brightest observations that never count as shadows, because a normal needs three
 
 
 def lit_observations(

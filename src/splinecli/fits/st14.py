@@ -27,11 +27,8 @@ from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 VIEW = (0.0, 0.0, 1.0)
 
-FEWEST_LIT = 4
-"""Number of brightest observations that never count as shadows: three for the normal, one for the noise."""
-
-RANGE = 0.25
-"""Divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible."""
+FEWEST_LIT = 4  # number of brightest observations that never count as shadows: three for the normal, one for the noise
+RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
 """Order in which coefficients enter the model.
@@ -39,18 +36,14 @@ PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
 Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come first; within a degree, those with larger a.
 """
 
-FIRST_NOISE = 1e-3
-"""Initial standard deviation of the noise, relative to the brightest kept observation."""
+FIRST_NOISE = 1e-3  # initial standard deviation of the noise, relative to the brightest kept observation
 
 TURNED_AWAY = 10.0
 """Cost, for each unit of cosine, of a normal that faces away from the view or from a light that reaches it."""
 
 
-SHADOW_SHARE = 0.4
-"""Observations below this share of the pixel's quantile UNSHADED are shadows."""
-
-KEPT_SHARE, FEWEST_KEPT = 0.25, 8
-"""How many of the others are kept; see kept_count. The first is T_low in the paper."""
+SHADOW_SHARE = 0.4  # observations below this share of the pixel's quantile UNSHADED are shadows
+KEPT_SHARE, FEWEST_KEPT = 0.25, 8  # How many of the others are kept; see kept_count. The first is T_low in the paper.
 
 SPREAD = 0.1
 """Standard deviation of the prior on the two linear coefficients, relative to the brightest kept observation. It halves
@@ -92,36 +85,26 @@ def coefficient_count(kept: Tensor) -> Tensor:
 
 
 class _Problem(NamedTuple):
-    """The kept observations of a batch of pixels, at most K each, and the prior.
+    """The kept observations of a batch of pixels, at most K each, and the prior."""
 
-    intensities: (P, K), the largest of a pixel 1. lights, bisectors: (P, K, 3). light_powers: (P, K, 3), powers of 1 -
-    l.h. precision: (9,), of the prior. ridge: (P, 9), which removes coefficients from the model. facing: (P, F + 1, 3),
-    the directions that the normal has to face.
-    """
-
-    intensities: Tensor
-    lights: Tensor
-    bisectors: Tensor
-    light_powers: Tensor
-    precision: Tensor
-    ridge: Tensor
-    facing: Tensor
+    intensities: Tensor  # (P, K), the largest of a pixel 1
+    lights: Tensor  # (P, K, 3)
+    bisectors: Tensor  # (P, K, 3)
+    light_powers: Tensor  # (P, K, 3), powers of 1 - l.h
+    precision: Tensor  # (9,), of the prior
+    ridge: Tensor  # (P, 9), which removes coefficients from the model
+    facing: Tensor  # (P, F + 1, 3), the directions that the normal has to face
 
 
 class _Fit(NamedTuple):
-    """The best reflectance for given normals, and the derivatives of its cost.
+    """The best reflectance for given normals, and the derivatives of its cost."""
 
-    normals: (P, 3). cost: (P,). noise: (P,), the variance estimated from the residual. tangents: (P, 3, 2), the
-    directions in which the normal can move. gradient, curvature: (P, 2) and (P, 2, 2), half the derivatives of the cost
-    along the tangents.
-    """
-
-    normals: Tensor
-    cost: Tensor
-    noise: Tensor
-    tangents: Tensor
-    gradient: Tensor
-    curvature: Tensor
+    normals: Tensor  # (P, 3)
+    cost: Tensor  # (P,)
+    noise: Tensor  # (P,), the variance estimated from the residual
+    tangents: Tensor  # (P, 3, 2), the directions in which the normal can move
+    gradient: Tensor  # (P, 2), half the first derivative of the cost along the tangents
+    curvature: Tensor  # (P, 2, 2), half the second derivative
 
     def step(self, damping: Tensor) -> Tensor:
         """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean curvature."""

@@ -8,11 +8,8 @@ from splinecli.fits.weighted_least_squares import weighted_least_squares
 TRIMMED_SHARE = 0.2
 """Share of the observations that is left out at each end: with ten lights, the two darkest and the two brightest."""
 
-SHADOW_SHARE = 0.1
-"""Share of the pixel's quantile UNSHADED, as in IW12. Darker observations are shadows."""
-
-FEWEST = 4
-"""Smallest number of observations that stay: one more than a normal and an albedo need."""
+SHADOW_SHARE = 0.1  # Share of the pixel's quantile UNSHADED, as in IW12. Darker observations are shadows.
+FEWEST = 4  # smallest number of observations that stay: one more than a normal and an albedo need
 
 
 def solve(observations: Tensor, light_directions: Tensor) -> Tensor:

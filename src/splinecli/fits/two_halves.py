@@ -17,18 +17,14 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing.
+    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing."""
 
-    Attributes:
-        normals: (P, 3), unit, of least squares with all lights.
-        change: (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a
-            share of the albedo. On a ring of lights, it is half the difference between the normals of the halves.
-        noise: (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal
-            noise. Three lights have no residuals, so they do not show it.
-    """
-
-    normals: Tensor
+    normals: Tensor  # (P, 3), unit, of least squares with all lights
+    # (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a share of
+    # the albedo. On a ring of lights, it is half the difference between the normals of the halves
     change: Tensor
+    # (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal noise.
+    # Three lights have no residuals, so they do not show it
     noise: Tensor
 
 

@@ -6,8 +6,7 @@ from torch import Tensor
 from splinecli.maths.observation_map import dot
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
-RIDGE = 1e-12
-"""Weight of |b|^2. It matters only where the lights of positive weight lie in one plane."""
+RIDGE = 1e-12  # Weight of |b|^2. It matters only where the lights of positive weight lie in one plane.
 
 _TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
 

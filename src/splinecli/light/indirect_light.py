@@ -69,18 +69,11 @@ class PixelPlaces:
 
 @dataclass(frozen=True)
 class IndirectLight:
-    """The indirect light of a capture with P pixels.
+    """The indirect light of a capture with P pixels."""
 
-    Args:
-        blocks: blocks of the mask's pixels.
-        arriving: (h, w, F), the light that arrives at each block from the others. Other cells have that of the nearest.
-        albedo: (P,), the share of the arriving light that a pixel reflects.
-        pixels: the places of the pixels.
-    """
-
-    blocks: Blocks
-    arriving: Floats
-    albedo: NDArray[np.floating]
+    blocks: Blocks  # of the mask's pixels
+    arriving: Floats  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
+    albedo: NDArray[np.floating]  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
     def at(self, rows: Rows) -> Floats:
@@ -90,8 +83,7 @@ class IndirectLight:
 
     def remove(self, observations: Floats, rows: Rows) -> Floats:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
-        left = np.maximum(observations - self.at(rows), _LEAST_LEFT * observations)
-        return np.asarray(left, np.float32)
+        return np.asarray(np.maximum(observations - self.at(rows), _LEAST_LEFT * observations), np.float32)
 
     def counts_at(self, observations: Floats, rows: Rows) -> NDArray[np.bool_]:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
@@ -148,12 +140,8 @@ def find_indirect_light(
 def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Floats:
     """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
 
-    Nothing between two blocks hides them from each other.
-
-    Args:
-        covered: (p,), the share of each block that the mask covers.
-        normals: (p, 3), unit.
-        sent: (p, F), the radiance of each block.
+    Nothing between two blocks hides them from each other. `covered` (p,) is the share of each block that the mask
+    covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
     normal_map = np.zeros((*blocks.mask.shape, 3))
     normal_map[blocks.mask] = normals

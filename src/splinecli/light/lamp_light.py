@@ -39,19 +39,12 @@ def flat_depth(lamps: NearLamps) -> float:
 
 @dataclass(frozen=True)
 class LampLight:
-    """Observations as distant lamps would give them, with the light directions of each pixel.
+    """Observations as distant lamps would give them, with the light directions of each pixel."""
 
-    Args:
-        observations: (P, F), without the falloff of the lamps.
-        directions: unit; (P, F, 3) in each pixel's own frame, whose z axis points from the surface to the camera, or
-            (F, 3) for distant lights.
-        turns: (P, 3, 3), from the capture's frame to the pixels' own. None for an orthographic camera, where all are
-            one frame.
-    """
-
-    observations: NDArray[np.float32]
+    observations: NDArray[np.float32]  # (P, F), without the falloff of the lamps
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights
     directions: NDArray[np.floating]
-    turns: NDArray[np.float32] | None = None
+    turns: NDArray[np.float32] | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
 
     @classmethod
     def of(cls, observations: NDArray[np.float32], lamps: NearLamps) -> LampLight:
@@ -73,14 +66,9 @@ class LampLight:
         return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
 
 
-Rows = NDArray[np.integer]
-"""Numbers of some of a capture's pixels, in the order of its mask."""
-
-LightOf = Callable[[Rows], LampLight]
-"""From rows of a capture's pixels to their observations and light directions."""
-
-LIT_AT_ONCE = 1 << 14
-"""Pixels whose light is asked for at once: under near lamps, each has its own lights."""
+Rows = NDArray[np.integer]  # numbers of some of a capture's pixels, in the order of its mask
+LightOf = Callable[[Rows], LampLight]  # from rows of a capture's pixels to their observations and light directions
+LIT_AT_ONCE = 1 << 14  # pixels whose light is asked for at once: under near lamps, each has its own lights
 
 
 def parts_of_rows(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[Rows]:

@@ -15,14 +15,12 @@ from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 
-MIN_PIXELS = 20
-"""Fewer lit pixels at the outline show no rotation."""
+MIN_PIXELS = 20  # fewer lit pixels at the outline show no rotation
 
 _SMOOTHING = 0.02
 """Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
 
-_BORDER = 0.01
-"""Masks of objects that fill the image may leave out a border of this share of its sides."""
+_BORDER = 0.01  # masks of objects that fill the image may leave out a border of this share of its sides
 
 _RIM_Z = 0.25
 """Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
@@ -33,15 +31,10 @@ _ROUNDS, _CONVERGED = 25, 1e-4
 
 
 class OutlineTurn(NamedTuple):
-    """A rotation that turns the normals at the outline outwards.
+    """A rotation that turns the normals at the outline outwards."""
 
-    Attributes:
-        rotation: (3,), the rotation vector of lights and normals.
-        spread: the median of what remains of the z of these normals. It is small where the outline is one of a smooth
-            surface that the fit explains.
-    """
-
-    rotation: Array
+    rotation: Array  # (3,), the rotation vector of lights and normals
+    # the median of what remains of the z of these normals; small where the outline is that of a smooth surface
     spread: float
 
     def share(self, part: float) -> Array:
@@ -54,9 +47,7 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows; None where it shows none.
-
-    The border of the image is no outline.
+    """Return the rotation of the lights that the outline shows, which the border of the image is not; None for none.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.

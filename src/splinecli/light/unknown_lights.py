@@ -35,8 +35,7 @@ LEAST_SIDE = 0.15
 
 SIDES: dict[str, tuple[float, float]] = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
-SAME_IMAGES = 0.01
-"""Images that differ by less from their mean, as a share of it, show no light that moves."""
+SAME_IMAGES = 0.01  # images that differ by less from their mean, as a share of it, show no light that moves
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near
@@ -87,25 +86,18 @@ def find_lights(
     if first_light is not None:
         towards = float(directions[0, :2] @ SIDES[first_light])
         if abs(towards) < LEAST_SIDE:
-            raise InputError(
-                f"the first light does not come clearly from {first_light}, nor from the opposite side",
-                hint="Name the side that it is nearest to, or put an image whose light comes from a side first",
-            )
+            problem = f"the first light does not come clearly from {first_light}, nor from the opposite side"
+            hint = "Name the side that it is nearest to, or put an image whose light comes from a side first"
+            raise InputError(problem, hint=hint)
         directions = directions * (-1, -1, 1) if towards < 0 else directions
     if not intensities_known:
         observations = np.asarray(observations / intensities, np.float32)
-    fit = fit_near(
-        observations,
-        directions,
-        errors_deg,
-        intensity_error=0.0 if intensities_known else INTENSITY_ERROR,
-        worth_pixels=_WORTH_PIXELS,
-    )
+    error = 0.0 if intensities_known else INTENSITY_ERROR
+    fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=_WORTH_PIXELS)
     if refuse and fit is not None and fit.after > LARGEST_MISFIT:
-        raise InputError(
-            "the images do not show one surface under different distant lights, so the lights cannot be found",
-            hint="Check that camera and object stood still, and that all images show the same object",
-        )
+        problem = "the images do not show one surface under different distant lights, so the lights cannot be found"
+        hint = "Check that camera and object stood still, and that all images show the same object"
+        raise InputError(problem, hint=hint)
     if fit is not None and fit.after < fit.before and (fit.directions[:, 2] > 0).all():
         directions, intensities = fit.directions, intensities * fit.intensities
         observations = np.asarray(observations / fit.intensities, np.float32)
@@ -130,10 +122,8 @@ def _check_different(observations: NDArray[np.float32]) -> None:
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
     mean = rows.mean(axis=1, keepdims=True)
     if np.abs(rows - mean).mean() <= SAME_IMAGES * mean.mean():  # equal for black images
-        raise InputError(
-            "all images are alike, so they say nothing about the lights",
-            hint="Photograph the object with the lamp at a different place for each image",
-        )
+        problem = "all images are alike, so they say nothing about the lights"
+        raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
 
 
 def _ask_network(

@@ -19,22 +19,13 @@ DEFAULT_METHOD = "spline-net"
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Settings of a method. Each method ignores those that do not apply to it.
+    """Settings of a method, None for its default. Each method ignores those that do not apply to it."""
 
-    weights: a shipped name or a file.
-    rotations: number of rotations of the lights whose normals a network averages.
-    batch_size: pixels per batch. A processor computes a batch on each core.
-    device: where to compute; "auto" is a CUDA GPU if there is one.
-    precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
-
-    None stands for the method's default.
-    """
-
-    weights: str | None = None
-    rotations: int | None = None
-    batch_size: int | None = None
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    weights: str | None = None  # a shipped name or a file
+    rotations: int | None = None  # number of rotations of the lights whose normals a network averages
+    batch_size: int | None = None  # pixels per batch. A processor computes a batch on each core
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # "auto" is a CUDA GPU if there is one
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"  # "auto" is bfloat16 where the device has it natively
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
@@ -69,7 +60,6 @@ def _least_squares(*_: object) -> Estimator:
 
 
 def _solver(name: str, options: MethodOptions, *, module: str, batch_size: int) -> Estimator:
-    """Return a method whose `solve` is in a module of `splinecli.fits`."""
     from splinecli.methods.batched import BatchedEstimator
     from splinecli.system.devices import choose_device, use_available_cores
 
@@ -97,8 +87,7 @@ def _network(name: str, options: MethodOptions, *, weights: str, rotations: int,
     )
 
 
-_BATCH = {"cpu": 256, "cuda": 1024}
-"""Pixels in a network's batch. Processors compute a batch on each core."""
+_BATCH = {"cpu": 256, "cuda": 1024}  # Pixels in a network's batch. Processors compute a batch on each core.
 
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
     "spline-net": partial(_network, weights="spline-net", rotations=1),

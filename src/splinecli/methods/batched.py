@@ -18,25 +18,18 @@ from splinecli.system.side_by_side import side_by_side
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
 
-The normals may have any length; a zero vector means that the pixel has none. All observations are finite, and none is
-negative.
-"""
+The normals may have any length, 0 for a pixel that has none. All observations are finite, and none is negative."""
 
 
 @dataclass(frozen=True)
 class BatchedEstimator:
     """An estimator that calls `solve` on batches of pixels, in float64.
 
-    Args:
-        name: the method's name in the registry.
-        solve: see Solve. Each pixel is first divided by its largest observation. Thresholds and priors then mean
-            the same for dark and bright pixels, and the scale of the images does not matter.
-
-    Raises:
-        UsageError: batch_size is below 1.
+    Each pixel is first divided by its largest observation. Thresholds and priors then mean the same for dark and bright
+    pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
     """
 
-    name: str
+    name: str  # in the registry
     solve: Solve
     device: str
     batch_size: int

@@ -44,20 +44,13 @@ _LARGEST_SHARE = 0.7  # of the expected error; on rendered pixels, more cost 0.3
 
 @dataclass(frozen=True)
 class Distillation:
-    """What was learned, and how well.
+    """What was learned, and how well."""
 
-    Args:
-        sample: number of pixels that the network estimated for learning.
-        held_out: number of these that were not learned. They are an even sample of the capture.
-        mean_deg, p95_deg: angles between perceptron and network on the pixels held out.
-        expected_deg: the mean error that the network expects of itself on them.
-    """
-
-    sample: int
-    held_out: int
-    mean_deg: float
+    sample: int  # number of pixels that the network estimated for learning
+    held_out: int  # number of these that were not learned. They are an even sample of the capture
+    mean_deg: float  # mean_deg, p95_deg: angles between perceptron and network on the pixels held out
     p95_deg: float
-    expected_deg: float
+    expected_deg: float  # the mean error that the network expects of itself on them
 
     @property
     def is_good(self) -> bool:
@@ -73,11 +66,7 @@ class DistilledEstimator:
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
-        self,
-        teacher: ConfidentEstimator,
-        perceptron: Perceptron,
-        sample: PixelSample,
-        found: Distillation,
+        self, teacher: ConfidentEstimator, perceptron: Perceptron, sample: PixelSample, found: Distillation
     ) -> None:
         self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
         self.distillation = found
@@ -108,13 +97,13 @@ class DistilledEstimator:
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see ConfidentEstimator."""
-        normals = np.empty((len(observations), 3), np.float32)
-        errors = np.empty((len(observations), 2), np.float32)
+        normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
         unlike = np.empty(len(observations), np.bool_)
 
         def apply(rows: slice) -> slice:
-            found = self._apply(observations[rows], directions_at(light_directions, rows))
-            normals[rows], errors[rows], unlike[rows] = found
+            normals[rows], errors[rows], unlike[rows] = self._apply(
+                observations[rows], directions_at(light_directions, rows)
+            )
             return rows
 
         tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
@@ -190,24 +179,13 @@ def distil(
                 progress(int(done))
                 done -= int(done)
 
-        perceptron.learn(
-            inputs[held:],
-            normals[held:],
-            errors[held:],
-            steps=size.steps,
-            generator=generator,
-            progress=count,
-        )
+        learned_from = inputs[held:], normals[held:], errors[held:]
+        perceptron.learn(*learned_from, steps=size.steps, generator=generator, progress=count)
     with torch.inference_mode():
         learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
-    found = Distillation(
-        sample=len(inputs),
-        held_out=held,
-        mean_deg=float(angles.mean()),
-        p95_deg=float(np.quantile(angles, 0.95)),
-        expected_deg=float(median_error_deg(errors[:held]).mean()),
-    )
+    mean_deg, p95_deg = float(angles.mean()), float(np.quantile(angles, 0.95))
+    found = Distillation(len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean()))
     return DistilledEstimator(teacher, perceptron, sample, found)
 
 

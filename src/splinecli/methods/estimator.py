@@ -13,8 +13,7 @@ from splinecli.system.progress import Progress
 if TYPE_CHECKING:
     from splinecli.refinement.refiner import NetworkRefiner
 
-Observations = NDArray[np.float32]
-"""(P, F): linear, already divided by the light intensities."""
+Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
 Directions = NDArray[np.floating]
 """(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
@@ -58,11 +57,8 @@ class Estimator(Protocol):
         ...
 
 
-TILE_PIXELS = 16_384
-"""Pixels that an estimator gets at once, unless it has a `tile_pixels` of its own."""
-
-CONFIDENT_DEG = 5.0
-"""Confidence is the probability that a normal is off by at most this angle."""
+TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
 """The distribution of the error of a normal that nothing is known of. Its confidence is 0."""
@@ -70,10 +66,7 @@ UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
 
 @runtime_checkable
 class ConfidentEstimator(Estimator, Protocol):
-    """An estimator that can also estimate its own accuracy.
-
-    tells_confidence: whether its weights allow that.
-    """
+    """An estimator that can also estimate its own accuracy, if its weights allow that."""
 
     @property
     def tells_confidence(self) -> bool: ...

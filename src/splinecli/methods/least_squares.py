@@ -13,8 +13,7 @@ from splinecli.maths.solve_3x3 import solve_each
 from splinecli.methods.estimator import Directions, Observations
 from splinecli.system.progress import Progress
 
-TOWARDS_CAMERA = (0.0, 0.0, 1.0)
-"""The normal of a pixel that is dark under every light."""
+TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is dark under every light
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from splinecli.surface.integration import integrate_normals
 ROUNDS = 2
 """Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
 
-METHOD = "iw12"
-"""The fit on the way: fast, and robust against shadows and highlights."""
+METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
 
 PIXELS_ON_THE_WAY = 40_000
 """Larger captures are fitted on the way at about this size: fine detail hardly moves the surface."""

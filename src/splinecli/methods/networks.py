@@ -51,17 +51,12 @@ class NetworkEstimator:
         interpolates = loaded.network.config.interpolates
         if interpolates == (name == "cnn-ps"):
             kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
-            raise ModelError(
-                f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
-                hint=f"Use them with --method {fitting}",
-            )
+            problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
+            raise ModelError(problem, hint=f"Use them with --method {fitting}")
         if rotations < 1 or batch_size < 1:
             raise UsageError("rotations and batch size are whole numbers from 1")
-        self.name = name
-        self.weights = {"name": loaded.name, "sha256": loaded.sha256}
-        self.device = str(device)
-        self.precision = str(precision)
-        self.batch_size = batch_size
+        self.name, self.weights = name, {"name": loaded.name, "sha256": loaded.sha256}
+        self.device, self.precision, self.batch_size = str(device), str(precision), batch_size
         self.network = loaded.network.to(device)
         refine_net = self.network.refine_net
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
@@ -132,20 +127,17 @@ class NetworkEstimator:
             The sparse maps, LI-Net's dense maps, and the sparse maps of all lights. Each is (P, w, w) in the pixels'
             own frames, divided by the largest of the pixel's F observations, and NaN in empty cells.
         """
-        device, network = self.device, self.network
-        maps = network.build_maps(
-            torch.as_tensor(observations, dtype=torch.float32, device=device),
-            torch.as_tensor(light_directions, dtype=torch.float32, device=device),
+        network, config = self.network, self.network.config
+        seen, lights, all_seen, all_lights = (
+            torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for values in (observations, light_directions, all_observations, all_directions)
         )
+        maps = network.build_maps(seen, lights)
         dense = network.interpolate(maps)
         assert dense is not None, "CNN-PS has no dense maps"
-        turned = rotate_about_view_axis(
-            torch.as_tensor(all_directions, dtype=torch.float32, device=device).expand(len(observations), -1, 3),
-            maps.cosine[:, None],
-            maps.sine[:, None],
-        )
-        values = torch.as_tensor(all_observations, dtype=torch.float32, device=device) / maps.scale
-        config = network.config
+        all_lights = all_lights.expand(len(observations), -1, 3)
+        turned = rotate_about_view_axis(all_lights, maps.cosine[:, None], maps.sine[:, None])
+        values = all_seen / maps.scale
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
         def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:

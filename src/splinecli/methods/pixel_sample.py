@@ -5,28 +5,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-CELLS = 256
-"""Number of groups of pixels of like appearance."""
-
-EVEN_SHARE = 0.5
-"""Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups."""
+CELLS = 256  # number of groups of pixels of like appearance
+EVEN_SHARE = 0.5  # Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups.
 
 
 @dataclass(frozen=True)
 class PixelSample:
-    """A sample of pixels, and the appearances that it covers.
+    """A sample of pixels, and the appearances that it covers."""
 
-    Args:
-        rows: (N,) distinct numbers of the pixels. The first EVEN_SHARE of them are an even sample of all pixels.
-        centres: (K, C), the features at the centres of the groups.
-        rare: (K,) bool, the groups of fewest pixels.
-        reach: the largest distance of a pixel, among those that could be drawn, from the nearest centre.
-    """
-
-    rows: Tensor
-    centres: Tensor
-    rare: Tensor
-    reach: float
+    rows: Tensor  # (N,) distinct numbers of the pixels. The first EVEN_SHARE are an even sample of all pixels
+    centres: Tensor  # (K, C), the features at the centres of the groups
+    rare: Tensor  # (K,) bool, the groups of fewest pixels
+    reach: float  # the largest distance of a pixel, among those that could be drawn, from the nearest centre
 
     def unlike(self, features: Tensor) -> Tensor:
         """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
@@ -60,11 +50,14 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
     n_even = round(EVEN_SHARE * size)
     centres, nearest, reach = _group(features)
     counts = torch.bincount(nearest, minlength=len(centres))
+    by_count = torch.argsort(counts, stable=True)
+    rare = torch.empty_like(counts, dtype=torch.bool)
+    rare[by_count] = counts[by_count].cumsum(0) <= rare_share * int(counts.sum())
     left = order[n_even:]
     # One pixel of each group in turn, until there are enough.
     turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
     rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
-    return PixelSample(rows, features[centres], _rarest(counts, rare_share), reach)
+    return PixelSample(rows, features[centres], rare, reach)
 
 
 def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -79,11 +72,8 @@ def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
         nearest[new < distance] = number
         distance = torch.minimum(distance, new)
         centres.append(int(distance.argmax()))
-    return (
-        torch.tensor(centres[:-1], device=features.device),
-        nearest,
-        float(distance.amax().clamp(min=0).sqrt()),
-    )
+    reach = float(distance.amax().clamp(min=0).sqrt())
+    return torch.tensor(centres[:-1], device=features.device), nearest, reach
 
 
 def _rank_in_group(groups: Tensor) -> Tensor:
@@ -93,11 +83,3 @@ def _rank_in_group(groups: Tensor) -> Tensor:
     rank = torch.empty_like(groups)
     rank[by_group] = torch.arange(len(groups)) - (counts.cumsum(0) - counts)[groups[by_group]]
     return rank
-
-
-def _rarest(counts: Tensor, share: float) -> Tensor:
-    """Return the groups (K,) of fewest pixels that have at most this share of all together."""
-    by_count = torch.argsort(counts, stable=True)
-    rare = torch.empty_like(counts, dtype=torch.bool)
-    rare[by_count] = counts[by_count].cumsum(0) <= share * int(counts.sum())
-    return rare

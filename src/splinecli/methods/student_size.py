@@ -2,23 +2,16 @@
 
 from dataclasses import dataclass
 
-FEWEST_PIXELS = 64
-"""The smallest sample that can be learned from."""
+FEWEST_PIXELS = 64  # the smallest sample that can be learned from
 
 
 @dataclass(frozen=True)
 class StudentSize:
-    """How much is learned.
+    """How much is learned."""
 
-    Args:
-        sample: number of pixels that the network estimates.
-        steps: steps of learning.
-        width: units in each hidden layer of the perceptron.
-    """
-
-    sample: int
-    steps: int
-    width: int
+    sample: int  # number of pixels that the network estimates
+    steps: int  # steps of learning
+    width: int  # units in each hidden layer of the perceptron
 
 
 def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:

@@ -11,8 +11,8 @@ from splinecli.capture.capture_warnings import estimated_lights
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.capture.summary import CaptureSummary, summarise_capture
-from splinecli.diagnosis.checks import check_sample
-from splinecli.diagnosis.evidence import StatedLights
+from splinecli.diagnosis.checks import check_evidence
+from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.student_size import student_sizes
@@ -86,9 +86,9 @@ def describe_capture(
             errors_deg = None if found_lights is None else found_lights.errors_deg
             write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
         check, warnings = None, summary.warnings()
-        if summary.sample is not None and summary.closeup is not None:
-            lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
-            check, found = check_sample(lights, summary.sample, summary.closeup, strict=reading.strict)
+        if summary.samples is not None:
+            indices = range(source.n_lights)
+            check, found = check_evidence(Evidence.of_source(source, summary.samples, indices, strict=reading.strict))
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))
@@ -169,9 +169,10 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
 
 def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
     """Return the summary with the lights that are found from its sample, and these; None where files give them."""
-    source, sample = summary.source, summary.sample
-    if source.find_lights is None or sample is None:
+    source = summary.source
+    if source.find_lights is None or summary.samples is None:
         return summary, None
+    sample, _ = summary.samples
     try:
         found = source.find_lights(sample.observations, sample.mask, source.intensities_known)
     except InputError as error:

@@ -11,17 +11,10 @@ from torch.nn.functional import avg_pool2d
 from splinecli.networks.refine_net import gaussian_sum, reach_of, unit_maps
 from splinecli.refinement.halving import enlarge
 
-FINE = 1.5
-"""Detail is what a Gaussian filter with this sigma in pixels removes."""
-
-WINDOW = 3.0
-"""Detail is compared in a Gaussian window with this sigma in pixels."""
-
-REACH = reach_of(FINE) + reach_of(WINDOW)
-"""No pixel further away than this changes a result."""
-
-FEWEST_LIGHTS = 6
-"""Fewer have no residuals, or hardly any, and so do not show noise well."""
+FINE = 1.5  # detail is what a Gaussian filter with this sigma in pixels removes
+WINDOW = 3.0  # detail is compared in a Gaussian window with this sigma in pixels
+REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
+FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show noise well
 
 _LEAST_REAL, _SURELY_REAL = 0.7, 0.9
 """Share of the energy of missing detail that is no noise. Below the first number nothing is restored, above the second

@@ -21,12 +21,7 @@ _HALVES_SCALE = 3.0  # brings these small numbers near the others
 
 @torch.no_grad()
 def refine_features(
-    observations: Tensor,
-    light_directions: Tensor,
-    normals: Tensor,
-    error: Tensor,
-    reference: float,
-    signs: Tensor,
+    observations: Tensor, light_directions: Tensor, normals: Tensor, error: Tensor, reference: float, signs: Tensor
 ) -> Tensor:
     """Return the features (P, CHANNELS) of pixels in the order of WIDTHS, each about -1 to 1.
 
@@ -102,10 +97,7 @@ def turn_features(features: Tensor, turn: Turn) -> Tensor:
 
 
 def turn_maps(
-    maps: Tensor,
-    turn: Turn,
-    vectors: Sequence[tuple[int, int]] = (),
-    tensors: Sequence[tuple[int, int, int]] = (),
+    maps: Tensor, turn: Turn, vectors: Sequence[tuple[int, int]] = (), tensors: Sequence[tuple[int, int, int]] = ()
 ) -> Tensor:
     """Turn maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
     if turn.mirror:

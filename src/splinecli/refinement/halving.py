@@ -16,28 +16,19 @@ from splinecli.system.side_by_side import side_by_side
 
 Floats = NDArray[np.float32]
 
-_DARK = 1e-6
-"""Weight of a pixel that is dark under every light, beside lit ones of the capture's brightness."""
+_DARK = 1e-6  # weight of a pixel that is dark under every light, beside lit ones of the capture's brightness
 
 
 @dataclass(frozen=True, eq=False)
 class HalfCapture:
-    """A capture whose pixels are the means of blocks of 2 x 2 pixels of another one, as far as these are in its mask.
+    """A capture whose pixels are the means of blocks of 2 x 2 pixels of another one, where its mask has any."""
 
-    Args:
-        mask: (H / 2, W / 2), with Q true pixels.
-        observations: (Q, F).
-        normals, errors: (Q, 3), unit, and (Q, 2), in the capture's frame.
-        members: (Q,), the row of one pixel of each block in the other capture. Its light directions hold for the block.
-        whole: gives the light of the other capture's pixels.
-    """
-
-    mask: NDArray[np.bool_]
-    observations: Floats
-    normals: Floats
-    errors: Floats
-    members: Rows
-    whole: LightOf
+    mask: NDArray[np.bool_]  # (H / 2, W / 2), with Q true pixels
+    observations: Floats  # (Q, F)
+    normals: Floats  # (Q, 3), unit, in the capture's frame
+    errors: Floats  # (Q, 2)
+    members: Rows  # (Q,), the row of one pixel of each block in the other capture; its lights hold for the block
+    whole: LightOf  # gives the light of the other capture's pixels
 
     @classmethod
     def of(
@@ -53,15 +44,9 @@ class HalfCapture:
         """
         half = _over_blocks(np.logical_or, mask)
         rows_above, done_above = pixels_before(mask), pixels_before(half)
-        n_half = int(done_above[-1])
-        small = cls(
-            half,
-            np.empty((n_half, light_of(np.arange(1)).observations.shape[1]), np.float32),
-            np.empty((n_half, 3), np.float32),
-            np.empty((n_half, 2), np.float32),
-            np.empty(n_half, np.int32),
-            light_of,
-        )
+        n_half, n_lights = int(done_above[-1]), light_of(np.arange(1)).observations.shape[1]
+        values, of_normals, of_errors = (np.empty((n_half, columns), np.float32) for columns in (n_lights, 3, 2))
+        small = cls(half, values, of_normals, of_errors, np.empty(n_half, np.int32), light_of)
         step = max(1, LIT_AT_ONCE // (2 * mask.shape[1]))  # rows of blocks
 
         def halve(first: int) -> None:
@@ -76,12 +61,10 @@ class HalfCapture:
             # A block's observations tell most about the normals of its brightest pixels.
             weights = np.maximum(largest, np.float32(_DARK * reference))
             found = np.hstack((normals[rows], errors[rows])) * weights
-            values = np.hstack((observations * equal, equal, found, weights))
-            maps = np.zeros((*seen.shape, values.shape[1]), np.float32)
-            maps[seen] = values
+            sent = np.hstack((observations * equal, equal, found, weights))
+            maps, numbers = np.zeros((*seen.shape, sent.shape[1]), np.float32), np.zeros(seen.shape, np.int32)
+            maps[seen], numbers[seen] = sent, rows
             sums = _over_blocks(np.add, maps)[kept]
-            numbers = np.zeros(seen.shape, np.int32)
-            numbers[seen] = rows
             done = slice(done_above[first], done_above[last])
             small.observations[done] = sums[:, :-7] / sums[:, -7:-6]
             small.normals[done] = unit(sums[:, -6:-3])
@@ -99,10 +82,7 @@ class HalfCapture:
     def enlarged(self, box: Box) -> tuple[torch.Tensor, torch.Tensor]:
         """Return normals (3, h, w), not of unit length, and errors (2, h, w) in a box of the other capture's map.
 
-        They are interpolated bilinearly between pixels of the mask.
-
-        Args:
-            box: between even rows and columns.
+        They are interpolated bilinearly between pixels of the mask. The box is between even rows and columns.
         """
         rows, columns = (slice(max(0, side.start // 2 - 1), side.stop // 2 + 1) for side in box)
         mask = self.mask[rows]

@@ -8,7 +8,7 @@ detail that is real; see detail.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -38,50 +38,30 @@ The net can see further (REACH), but what lies beyond the margin turns no normal
 TILE = 608
 """Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin comes on top.
 
-Larger tiles take less time, because their margins are smaller in all, and more memory.
-"""
+Larger tiles take less time, because their margins are smaller in all, and more memory."""
 
-MOST_PIXELS = 150_000
-"""The most pixels of a capture that the net sees as they are."""
+MOST_PIXELS = 150_000  # the most pixels of a capture that the net sees as they are
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 
 Floats = NDArray[np.float32]
-
-
 Maps = tuple[torch.Tensor, torch.Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """A capture to be refined, or a half of one.
+    """A capture to be refined, or a half of one."""
 
-    Args:
-        mask: (H, W), with P true pixels.
-        observations: (P, F). light_of: gives the light of some pixels.
-        normals, errors: (P, 3) and (P, 2), which are replaced.
-        reference, signs: of the whole capture; see refine_features.
-    """
-
-    mask: NDArray[np.bool_]
-    observations: Floats
-    light_of: LightOf
-    normals: Floats
+    mask: NDArray[np.bool_]  # (H, W), with P true pixels
+    observations: Floats  # (P, F)
+    light_of: LightOf  # gives the light of some pixels
+    normals: Floats  # (P, 3), replaced, as are the errors (P, 2)
     errors: Floats
-    reference: float
+    reference: float  # reference, signs: of the whole capture; see refine_features
     signs: torch.Tensor
 
-    def halved(self, half: HalfCapture) -> _Capture:
-        return replace(
-            self,
-            mask=around_object(half.mask),
-            observations=half.observations,
-            light_of=half.light_of,
-            normals=half.normals,
-            errors=half.errors,
-        )
 
-
+@dataclass(eq=False)
 class NetworkRefiner:
     """Corrects the normals of a capture, and the distributions of their errors, by what lies around each pixel.
 
@@ -94,23 +74,17 @@ class NetworkRefiner:
             sees their maps as they are, on more pixels once rather than in all turns.
     """
 
-    def __init__(
-        self,
-        network: RefineNet,
-        precision: str,
-        *,
-        turns: int = 4,
-        tile: int = TILE,
-        margin: int = MARGIN,
-        most_pixels: int = MOST_PIXELS,
-    ) -> None:
-        assert tile % COARSEST == 0 == margin % COARSEST
-        assert tile >= margin, "the margin of a tile must be within its neighbours"
-        self.network = network
-        self.precision = precision
-        self.turns = turns
-        self.tile, self.margin = tile, margin
-        self.most_pixels = most_pixels
+    network: RefineNet
+    precision: str
+    _: KW_ONLY
+    turns: int = 4
+    tile: int = TILE
+    margin: int = MARGIN
+    most_pixels: int = MOST_PIXELS
+
+    def __post_init__(self) -> None:
+        assert self.tile % COARSEST == 0 == self.margin % COARSEST
+        assert self.tile >= self.margin, "the margin of a tile must be within its neighbours"
 
     @torch.inference_mode()
     def refine(
@@ -134,41 +108,27 @@ class NetworkRefiner:
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
         """
-        device = self.network.enter.weight.device
         middle = light_of(np.array([len(normals) // 2])).directions  # as one pixel sees the lights
-        directions = torch.as_tensor(middle, dtype=torch.float32, device=device).view(-1, 3)
-        capture = _Capture(
-            around_object(mask),
-            observations,
-            light_of,
-            normals,
-            errors,
-            brightness(torch.from_numpy(observations)),
-            alternating_signs(directions),
-        )
-        self._refine(capture, progress)
+        of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
+        self._refine(_Capture(around_object(mask), observations, light_of, normals, errors, *of_whole), progress)
 
     def _refine(self, capture: _Capture, progress: Progress | None = None) -> None:
-        """Refine a capture in place."""
-        half, turns, margin = None, self.turns, self.margin
+        half, turns, margin, whole = None, self.turns, self.margin, (capture.normals, capture.errors)
         if len(capture.normals) > self.most_pixels:
             turns = 1
             if len(capture.signs) >= FEWEST_LIGHTS:
-                half = HalfCapture.of(
-                    capture.mask, capture.light_of, capture.normals, capture.errors, capture.reference
-                )
-                margin = _DETAIL_MARGIN
-                self._refine(capture.halved(half))
+                half = HalfCapture.of(capture.mask, capture.light_of, *whole, capture.reference)
+                margin, of_half = _DETAIL_MARGIN, (half.observations, half.light_of, half.normals, half.errors)
+                self._refine(_Capture(around_object(half.mask), *of_half, capture.reference, capture.signs))
         lit = capture.observations.max(axis=1) > 0
-        above = Band(slice(0, 0), capture.normals, capture.errors)
+        above = Band(slice(0, 0), *whole)
 
         def refine(tile: Tile) -> tuple[Rows, Floats, Floats]:
-            own = tile.rows[tile.inner][tile.mask[tile.inner]]
+            inside = tile.mask[tile.inner]
+            own = tile.rows[tile.inner][inside]
             seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
             maps = self._see(capture, tile, seen, turns) if half is None else self._enlarge(capture, tile, seen, half)
-            refined, errors = (
-                values[:, *inner].permute(1, 2, 0).cpu().numpy()[tile.mask[tile.inner]] for values in maps
-            )
+            refined, errors = (values[:, *inner].permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
             _turn_back(refined, own, capture.light_of)
             return own, refined, errors
 
@@ -176,7 +136,7 @@ class NetworkRefiner:
         run = map if half is None else side_by_side
         for pixels, tiles in rows_of_tiles(capture.mask, self.tile, margin):
             return_freed_memory()  # what the tiles above left is in pieces
-            band = Band(pixels, capture.normals, capture.errors)
+            band = Band(pixels, *whole)
             for own, refined, errors in run(refine, tiles):
                 # Nothing is known of a pixel that is dark under every light.
                 known = lit[own]
@@ -233,11 +193,9 @@ class NetworkRefiner:
     def _maps(
         self, tile: Tile, columns: int, light_of: LightOf, values_of: Callable[[Rows, LampLight, slice], torch.Tensor]
     ) -> torch.Tensor:
-        """Return maps (columns, h, w) of values of a tile's pixels, zero outside the mask.
+        """Return maps (columns, h, w), zero outside the mask, of a tile's values (N, columns).
 
-        Args:
-            values_of: gives the values (N, columns) of rows of the capture, from their light and their slice of the
-                tile's pixels.
+        `values_of` gives them from rows of the capture, their light and their slice of the tile's pixels.
         """
         maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
         rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
@@ -278,10 +236,11 @@ def _turn_back(normals: Floats, rows: Rows, light_of: LightOf) -> None:
 
 def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
     """Return a part of a map of this shape with all pixels that its detail depends on, and where the part is in it."""
-    grown, within = [], []
-    for side, length in zip(part, shape, strict=True):
+
+    def grow(side: slice, length: int) -> tuple[slice, slice]:
         start, stop, _ = side.indices(length)
         first = max(0, start - _DETAIL_MARGIN)
-        grown.append(slice(first, min(stop + _DETAIL_MARGIN, length)))
-        within.append(slice(start - first, stop - first))
-    return (grown[0], grown[1]), (within[0], within[1])
+        return slice(first, min(stop + _DETAIL_MARGIN, length)), slice(start - first, stop - first)
+
+    (rows, own_rows), (columns, own_columns) = map(grow, part, shape)
+    return (rows, columns), (own_rows, own_columns)

@@ -10,25 +10,17 @@ from splinecli.networks.refine_net import COARSEST, Part
 
 Floats = NDArray[np.float32]
 
-Box = tuple[slice, slice]
-"""Rows and columns of a map, both with a start and a stop."""
+Box = tuple[slice, slice]  # rows and columns of a map, both with a start and a stop
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A part of the map with a margin.
+    """A part of the map with a margin."""
 
-    Args:
-        box: where it is in the map, with the margin.
-        mask: (h, w), of the box; h and w are multiples of COARSEST, so that a turned tile has the same cells.
-        rows: (h, w), the rows of its pixels in the capture.
-        inner: the part of the box without the margin.
-    """
-
-    box: Box
-    mask: NDArray[np.bool_]
-    rows: NDArray[np.integer]
-    inner: Part
+    box: Box  # where it is in the map, with the margin
+    mask: NDArray[np.bool_]  # (h, w), of the box; multiples of COARSEST, so that a turned tile has the same cells
+    rows: NDArray[np.integer]  # (h, w), the rows of its pixels in the capture
+    inner: Part  # the part of the box without the margin
 
 
 class Band:
@@ -68,20 +60,18 @@ def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[t
         band = slice(max(0, top - margin), min(top + tile + margin, len(mask)))
         rows = mask[band].cumsum(dtype=np.int32).reshape(mask[band].shape)
         rows += int(above[band.start]) - 1
-        yield pixels, _tiles_of_band(mask[band], rows, band, top, tile, margin)
+        yield pixels, _tiles_of_band(mask[band], rows, band, slice(top - band.start, bottom - band.start), tile, margin)
 
 
 def _tiles_of_band(
-    mask: NDArray[np.bool_], rows: NDArray[np.integer], band: slice, top: int, tile: int, margin: int
+    mask: NDArray[np.bool_], rows: NDArray[np.integer], band: slice, inside: slice, tile: int, margin: int
 ) -> Iterator[Tile]:
-    """Yield the tiles of a band of the map with a margin. They begin at the map's row `top`."""
+    """Yield the tiles of a band of the map whose rows `inside` are no margin."""
     for left in range(0, mask.shape[1], tile):
         outer = slice(max(0, left - margin), min(left + tile + margin, mask.shape[1]))
-        seen = mask[:, outer]
-        first, start = top - band.start, left - outer.start
-        inner = slice(first, first + tile), slice(start, start + tile)
-        if seen[inner].any():
-            yield Tile((band, outer), seen, rows[:, outer], inner)
+        inner = inside, slice(left - outer.start, left - outer.start + tile)
+        if mask[:, outer][inner].any():
+            yield Tile((band, outer), mask[:, outer], rows[:, outer], inner)
 
 
 def pixels_before(mask: NDArray[np.bool_]) -> NDArray[np.int64]:

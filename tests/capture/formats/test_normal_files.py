@@ -32,8 +32,8 @@ def normals() -> NDArray[np.float64]:
     return np.asarray(field)
 
 
-def read_normals(path: Path, shape: tuple[int, int], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return read_ground_truth(path, shape, mask)[0]
+def read_normals(path: Path, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return read_ground_truth(path, mask)[0]
 
 
 def write(path: Path, normals: NDArray[np.float64]) -> Path:
@@ -52,7 +52,7 @@ def write(path: Path, normals: NDArray[np.float64]) -> Path:
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
 @pytest.mark.parametrize("length", [1, 0.95, 40])
 def test_floating_point_sources(tmp_path: Path, normals: NDArray[np.float64], name: str, length: float) -> None:
-    read = read_normals(write(tmp_path / name, normals * length), SHAPE, MASK)
+    read = read_normals(write(tmp_path / name, normals * length), MASK)
     assert read.dtype == np.float32
     np.testing.assert_allclose(read, normals, atol=2e-7)
 
@@ -65,7 +65,7 @@ def test_pictures(
     has_normal = normals.any(axis=2)
     picture = encode_picture(normals, has_normal, bits=bits)
     path = write(tmp_path / name, picture) if name == "a.npy" else write_image(name, picture)
-    read = read_normals(path, SHAPE, MASK)
+    read = read_normals(path, MASK)
     assert not read[~has_normal].any()
     assert angle_between_deg(read[has_normal], normals[has_normal]).max() < error_deg
     np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
@@ -73,7 +73,7 @@ def test_pictures(
 
 def test_a_gray_background_is_no_normal(write_image: WriteImage, normals: NDArray[np.float64]) -> None:
     picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)  # zero vectors become 128, 128, 128
-    assert not read_normals(write_image("a.png", picture), SHAPE, np.ones(SHAPE, bool))[1, 2].any()
+    assert not read_normals(write_image("a.png", picture), np.ones(SHAPE, bool))[1, 2].any()
 
 
 def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(
@@ -83,7 +83,7 @@ def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(
     stored[0] = [0, 0, 1]
     stored[2, 3] = [np.nan, 0, 1]
     stored[3, 3] = [0, np.inf, 1]
-    read = read_normals(write(tmp_path / "a.npy", stored), SHAPE, MASK)
+    read = read_normals(write(tmp_path / "a.npy", stored), MASK)
     assert not read[0].any()
     assert not read[[1, 2, 3], [2, 3, 3]].any()
     assert np.count_nonzero(read.any(axis=2)) == 12
@@ -92,66 +92,66 @@ def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(
 def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"N": normals, "mask": MASK})
-    np.testing.assert_allclose(read_normals(path, SHAPE, MASK), normals, atol=1e-6)
+    np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
     scipy.io.savemat(path, {"N": normals, "M": normals})
     with pytest.raises(InputError, match="found no Normal_gt, and of other H x W x 3 arrays N, M, expected one"):
-        read_normals(path, SHAPE, MASK)
+        read_normals(path, MASK)
     scipy.io.savemat(path, {"mask": MASK})
     with pytest.raises(InputError, match="found no Normal_gt, and of other H x W x 3 arrays none, expected one"):
-        read_normals(path, SHAPE, MASK)
+        read_normals(path, MASK)
 
 
 def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     path = tmp_path / "a.txt"
     rows = ["{:.9f}, {:.9f}, {:.9f}".format(*row) for row in normals.reshape(-1, 3)]
     path.write_text("\n".join(rows))
-    np.testing.assert_allclose(read_normals(path, SHAPE, MASK), normals, atol=1e-6)
+    np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
     path.write_text("\n".join([*rows[:6], "0 up 1", *rows[7:]]))
     with pytest.raises(InputError, match=r'a\.txt:7: found "up", expected a number\.'):
-        read_normals(path, SHAPE, MASK)
+        read_normals(path, MASK)
 
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.tif"])
 def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> None:
     with pytest.raises(InputError, match="found a ground truth of 5 x 3 pixels, expected 5 x 4 as in the images"):
-        read_normals(write(tmp_path / name, normals[1:]), SHAPE, MASK)
+        read_normals(write(tmp_path / name, normals[1:]), MASK)
 
 
 def test_text_with_a_wrong_number_of_rows(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     path = write(tmp_path / "a.txt", normals[1:])
     with pytest.raises(InputError, match="found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"):
-        read_normals(path, SHAPE, MASK)
+        read_normals(path, MASK)
 
 
 def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        read_normals(tmp_path / "a.npy", SHAPE, MASK)
+        read_normals(tmp_path / "a.npy", MASK)
     for name, message in [("a.mat", "MATLAB file is damaged"), ("a.npy", r"\.npy file is damaged")]:
         path = write(tmp_path / name, normals)
         path.write_bytes(path.read_bytes()[:150])
         with pytest.raises(InputError, match=message):
-            read_normals(path, SHAPE, MASK)
+            read_normals(path, MASK)
     (tmp_path / "a.exr").touch()
     with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png or \.tif'):
-        read_normals(tmp_path / "a.exr", SHAPE, MASK)
+        read_normals(tmp_path / "a.exr", MASK)
 
 
 def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
     path = write(tmp_path / "normal.txt", normals[::-1])
-    read, upside_down = read_ground_truth(path, SHAPE, MASK)
+    read, upside_down = read_ground_truth(path, MASK)
     assert upside_down
     np.testing.assert_allclose(read, normals, atol=2e-7)
-    assert not read_ground_truth(write(path, normals), SHAPE, MASK)[1]
+    assert not read_ground_truth(write(path, normals), MASK)[1]
     # A mask that is its own mirror image tells nothing.
     full = np.ones(SHAPE, bool)
-    np.testing.assert_allclose(read_normals(write(path, normals[::-1]), SHAPE, full), normals[::-1], atol=2e-7)
+    np.testing.assert_allclose(read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7)
 
 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="contains no array of numbers"):
-        read_normals(tmp_path / "a.npy", SHAPE, MASK)
+        read_normals(tmp_path / "a.npy", MASK)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -172,7 +172,7 @@ def test_a_huge_value_of_a_damaged_file_overflows_nothing(tmp_path: Path, normal
 def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
     plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
     scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
-    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", SHAPE, MASK), plane * MASK[..., None])
+    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", MASK), plane * MASK[..., None])
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -201,7 +201,7 @@ def test_matlab_s_undefined_types_are_refused(tmp_path: Path, kind: int, compres
     """SciPy's reader ends the process."""
     path = write_mat(tmp_path / "a.mat", np.zeros((*SHAPE, 3)), "<", kind=kind, compressed=compressed)
     with pytest.raises(InputError, match="the MATLAB file is damaged and cannot be read"):
-        read_normals(path, SHAPE, MASK)
+        read_normals(path, MASK)
 
 
 def write_mat(path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool) -> Path:

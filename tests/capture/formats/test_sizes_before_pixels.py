@@ -118,7 +118,7 @@ def refused(work: Callable[[], object], match: str) -> None:
 
 
 def ground_truth(path: Path) -> object:
-    return read_ground_truth(path, SMALL, np.ones(SMALL, np.bool_))
+    return read_ground_truth(path, np.ones(SMALL, np.bool_))
 
 
 def test_images_too_large_to_read(tmp_path: Path) -> None:

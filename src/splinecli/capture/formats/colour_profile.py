@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths.transfer import GAMMAS, SRGB, TransferCurve, decode_transfer
 
-LARGEST_PROFILE = 1 << 22
-"""Bytes of a profile. Those of cameras and screens have a few kilobytes."""
+LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Those of cameras and screens have a few kilobytes.
 
 _MOST_TAGS = 100
 _SAMPLES = 4096  # of a curve that has no name

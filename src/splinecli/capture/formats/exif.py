@@ -50,30 +50,22 @@ def check_exposures(images: Sequence[ImageFacts]) -> None:
     for facts, exposure in found[1:]:
         first, expected = found[0]
         if abs(exposure.relative / expected.relative - 1) > _SAME:
-            raise InputError(
-                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
-                path=facts.path,
-                hint="Expose all images alike, or give each image's exposure as the intensity of its light"
-                " (--intensities FILE)",
-            )
+            hint = "Expose all images alike, or give each image's exposure as the intensity of its light"
+            problem = f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
+            raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
 
 
 def common_orientation(images: Sequence[ImageFacts]) -> int:
     """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT where they state none.
 
-    RAW files are not asked: their pixels are read as the sensor has them.
-
-    Raises:
-        InputError: two images state different orientations, so that their pixels do not fit on each other.
+    RAW files are not asked: their pixels are read as the sensor has them. Raises InputError for two images with
+    different ones, whose pixels do not fit on each other.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)
     orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
-            raise InputError(
-                f"found EXIF orientation {orientation}, expected {orientations[0]} as in {asked[0].path.name}",
-                path=facts.path,
-                hint="Export all images the same way up, without this tag",
-            )
+            problem = f"found EXIF orientation {orientation}, expected {orientations[0]} as in {asked[0].path.name}"
+            raise InputError(problem, path=facts.path, hint="Export all images the same way up, without this tag")
     return orientations[0] if orientations else UPRIGHT

@@ -19,7 +19,7 @@ from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_cu
 from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
 from splinecli.capture.formats.raw import RAW_SUFFIXES, raw_size
 from splinecli.capture.formats.tiff import first_page
-from splinecli.capture.paths import check_file
+from splinecli.capture.paths import check_file, reading
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, SRGB, TransferCurve
 
@@ -100,20 +100,17 @@ def read_facts(path: Path) -> ImageFacts:
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
     """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
     check_file(path, "an image")
-    try:
-        with path.open("rb") as file:
-            start, suffix = file.read(len(PNG)), path.suffix.lower()
-            file.seek(0)
-            if not start:
-                raise InputError("the file is empty", path=path)
-            otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
-            found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
-            kind = "RAW" if suffix in RAW_SUFFIXES else found
-            if kind is None:
-                raise InputError("found neither PNG, TIFF, JPEG nor BMP", path=path)
-            yield file, kind
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    with reading(path), path.open("rb") as file:
+        start, suffix = file.read(len(PNG)), path.suffix.lower()
+        file.seek(0)
+        if not start:
+            raise InputError("the file is empty", path=path)
+        otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
+        found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
+        kind = "RAW" if suffix in RAW_SUFFIXES else found
+        if kind is None:
+            raise InputError("found neither PNG, TIFF, JPEG nor BMP", path=path)
+        yield file, kind
 
 
 def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:

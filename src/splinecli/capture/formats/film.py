@@ -42,8 +42,8 @@ _MOST_CLIPPED = 0.01  # share of pixels that are overexposed
 _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
 
 
+# A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels.
 _Candidate = tuple[int, NDArray[np.float32], float, float]
-"""A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
 
 
 def is_film(path: Path) -> bool:
@@ -54,15 +54,13 @@ def is_film(path: Path) -> bool:
 def choose_frames(film: Path) -> tuple[int, ...]:
     """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights differ most.
 
-    Raises:
-        InputError: the film cannot be read, or its light does not move.
+    Raises InputError where the film cannot be read, or its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
     # Under another light, sharpness is another: only the frames around are compared.
-    around = [
-        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
-    ]
+    near = (slice(max(0, place - _NEIGHBOURS), place + _NEIGHBOURS + 1) for place in range(len(sharpness)))
+    around = [np.median(sharpness[frames]) for frames in near]
     usable = (
         (sharpness >= _BLURRED * np.array(around))
         & (light >= _DARK * np.median(light))
@@ -111,9 +109,8 @@ def _candidates(film: Path) -> list[_Candidate]:
         if not found:
             raise ValueError
     if number < _LEAST_READ * stated:
-        raise InputError(
-            f"the film breaks off: {number} of {stated:.0f} frames can be read", path=film, hint="Copy it again"
-        )
+        problem = f"the film breaks off: {number} of {stated:.0f} frames can be read"
+        raise InputError(problem, path=film, hint="Copy it again")
     return found
 
 

@@ -25,21 +25,17 @@ _IMAGES = 2  # images in memory while they are read; see read_ahead
 
 @dataclass(frozen=True)
 class ExpectedSize:
-    """The size (H, W) or (H, W, C) that an image must have.
+    """The size that an image must have."""
 
-    Messages say `like` what, such as the name of the first image, and `what` the image is, with its article.
-    """
-
-    shape: tuple[int, ...]
-    like: str
-    what: str = "an image"
+    shape: tuple[int, ...]  # (H, W) or (H, W, C)
+    like: str  # whose size it is, for messages, such as the name of the first image
+    what: str = "an image"  # what the image is, with its article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
         """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
             raise InputError(
-                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}",
-                path=path,
+                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
             )
 
 
@@ -52,20 +48,16 @@ def check_stored_size(
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        raise InputError(
-            f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels",
-            path=path,
-            hint="If the size is right, use a smaller copy of the image",
-        )
+        problem = f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
+        raise InputError(problem, path=path, hint="If the size is right, use a smaller copy of the image")
     check_memory(n_bytes, takes, path)
 
 
 def check_vectors(shape: tuple[int, ...], path: Path) -> None:
     """Raise InputError where an array is not H x W x 3."""
     if len(shape) != 3 or shape[2] != 3:
-        raise InputError(
-            f"found an array of {' x '.join(map(str, shape))}, expected a normal map, H x W x 3", path=path
-        )
+        sizes = " x ".join(map(str, shape))
+        raise InputError(f"found an array of {sizes}, expected a normal map, H x W x 3", path=path)
 
 
 def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
@@ -77,11 +69,8 @@ def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = Non
     """Raise InputError where less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
-        raise InputError(
-            f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available",
-            path=path,
-            hint=hint,
-        )
+        problem = f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available"
+        raise InputError(problem, path=path, hint=hint)
 
 
 def _size(shape: tuple[int, ...]) -> str:
@@ -95,8 +84,7 @@ def _gigabytes(n_bytes: float) -> str:
 def common_size(images: Sequence[ImageFacts]) -> StoredSize:
     """Return the size of the largest of some images.
 
-    Raises:
-        InputError: an image has another height or width than the first, is too large, or has no whole header.
+    Raises InputError where one has another height or width than the first, is too large, or has no whole header.
     """
     first = images[0]
     check_stored_size(*first.size, first.path)

@@ -51,10 +51,8 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
         check_stored_size(*size, path, expected)
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + _LONGEST_METADATA
         if length > most:  # it is read as a whole
-            raise InputError(
-                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
-                path=path,
-            )
+            problem = f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size"
+            raise InputError(problem, path=path)
         file.seek(0)
         pixels = _decode(file, kind, path)
     if expected is not None:
@@ -66,11 +64,8 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
-        raise InputError(
-            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
-            path=path,
-            hint="Save the image with 16 bits",
-        )
+        problem = f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones"
+        raise InputError(problem, path=path, hint="Save the image with 16 bits")
     if pixels.shape[2] in (2, 4):
         return pixels[:, :, :-1], pixels[:, :, -1]
     return pixels, None
@@ -173,8 +168,7 @@ def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[n
 def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     """Return stored values of any shape as float32 on the scale of read_image.
 
-    Raises:
-        InputError: a floating-point value is negative or not finite.
+    Raises InputError for a floating-point value that is negative or not finite.
     """
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused below
         values = stored.astype(np.float32)
@@ -186,11 +180,8 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise InputError("found a value that is not finite (NaN or infinity), expected a photograph", path=path)
     if lowest < 0:
-        raise InputError(
-            f"found the negative value {lowest:g}, expected a photograph",
-            path=path,
-            hint="Set values below zero, such as noise after a dark frame was subtracted, to zero",
-        )
+        hint = "Set values below zero, such as noise after a dark frame was subtracted, to zero"
+        raise InputError(f"found the negative value {lowest:g}, expected a photograph", path=path, hint=hint)
     return values
 
 
@@ -210,13 +201,9 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np
         return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
     if largest <= 0:
-        raise InputError(
-            "the mask is empty: every pixel is zero",
-            path=path,
-            hint="Paint the object white, or give no mask",
-        )
-    mask: NDArray[np.bool_] = (stored > stored.max() / 2).any(axis=2)
-    return mask
+        hint = "Paint the object white, or give no mask"
+        raise InputError("the mask is empty: every pixel is zero", path=path, hint=hint)
+    return np.asarray((stored > stored.max() / 2).any(axis=2))
 
 
 def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
@@ -224,7 +211,5 @@ def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
 
     Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
     """
-    if alpha is None:
-        return None
-    opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
-    return opaque if opaque.any() and not opaque.all() else None
+    opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)
+    return opaque if opaque is not None and opaque.any() and not opaque.all() else None

@@ -83,7 +83,6 @@ def _numbers(file: BinaryIO, variable: _Variable) -> NDArray[Any]:
 
 
 def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
-    """Yield the numeric variables of a file."""
     header = file.read(128)
     if header.startswith(b"MATLAB 7.3"):
         hint = "Save it with MATLAB's option -v7"

@@ -43,13 +43,10 @@ _LONGEST_NUMBER = 32  # characters of a number in a text, with what separates it
 
 
 class _Stored(NamedTuple):
-    """Vectors (H, W, 3) as a file stores them, and the alpha channel (H, W) of a picture.
+    """Vectors as a file stores them."""
 
-    The values of a picture are colours, n = 2 v / full scale - 1.
-    """
-
-    values: NDArray[Any]
-    alpha: NDArray[Any] | None
+    values: NDArray[Any]  # (H, W, 3); those of a picture are colours, n = 2 v / full scale - 1
+    alpha: NDArray[Any] | None  # (H, W), the alpha channel of a picture
     is_picture: bool
 
 
@@ -86,9 +83,7 @@ def read_normal_map(
     return normals
 
 
-def read_ground_truth(
-    path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], bool]:
+def read_ground_truth(path: StrPath, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], bool]:
     """Return ground truth (H, W, 3) float32, and whether its rows were turned upside down.
 
     Vectors have unit length, or are zero outside the mask and where there is no ground truth. Rows of text are turned
@@ -96,8 +91,7 @@ def read_ground_truth(
 
     Args:
         path: any of the files above; pictures as PNG or TIFF.
-        shape: (H, W) of the images.
-        mask: (H, W), True at the pixels whose normals are read.
+        mask: (H, W), of the size of the images, True at the pixels whose normals are read.
 
     Raises:
         InputError: the file cannot be read, has another size, or has no normal inside the mask.
@@ -109,9 +103,9 @@ def read_ground_truth(
             f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png or .tif', path=path
         )
     if suffix != ".txt":
-        stored = _read_vectors(path, ExpectedSize(shape, "the images", "a ground truth"))
+        stored = _read_vectors(path, ExpectedSize(mask.shape, "the images", "a ground truth"))
         return _to_normals(stored, mask, path), False
-    values = _read_text(path, *shape)
+    values = _read_text(path, *mask.shape)
     filled = (values != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
     upside_down = bool(turned - as_stored > _CLEARLY_BETTER * np.count_nonzero(mask))
@@ -121,9 +115,8 @@ def read_ground_truth(
 def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
     """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError.
 
-    The suffix decides: .mat and .npy are arrays, all others are pictures. Unsigned integers in a .npy file are a
-    picture, too. In a .mat file they are not, because MATLAB stores all whole numbers as bytes, such as the normals of
-    a plane.
+    Unsigned integers are a picture. In a .mat file they are not, because MATLAB stores all whole numbers as bytes, such
+    as the normals of a plane.
     """
     check_file(path, "a normal map")
     suffix, alpha = path.suffix.lower(), None
@@ -227,11 +220,8 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
         found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
-        raise InputError(
-            f"found an array of {found}, expected floating-point numbers H x W",
-            path=path,
-            hint="Save the depth as .npy, floating-point TIFF or EXR",
-        )
+        problem = f"found an array of {found}, expected floating-point numbers H x W"
+        raise InputError(problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR")
     depth = np.array(stored, np.float64)
     depth[~np.isfinite(depth)] = np.nan
     return depth

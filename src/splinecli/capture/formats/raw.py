@@ -94,8 +94,5 @@ def _libraw(path: Path) -> Iterator[ModuleType]:
     try:
         yield rawpy
     except (rawpy.LibRawError, OSError):
-        raise InputError(
-            "the RAW file is damaged or of a camera that LibRaw does not know",
-            path=path,
-            hint=f"Copy it again, or {otherwise}",
-        ) from None
+        problem = "the RAW file is damaged or of a camera that LibRaw does not know"
+        raise InputError(problem, path=path, hint=f"Copy it again, or {otherwise}") from None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import JPEG, PNG, TIFF
-from splinecli.capture.paths import check_file, is_substitution
+from splinecli.capture.paths import check_file, is_substitution, reading
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -43,6 +43,7 @@ class NumberRows:
 
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
+    names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
 
     def as_array(self) -> NDArray[np.float64]:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
@@ -50,12 +51,9 @@ class NumberRows:
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
         for (_, line, text), length in zip(self.rows, lengths, strict=True):
             if length != usual:
-                raise InputError(
-                    f"found {columns(length)}, expected {usual} as in the other lines",
-                    path=self.path,
-                    line=line,
-                    hint=DECIMAL_POINT if length > usual and has_decimal_commas(text) else None,
-                )
+                hint = DECIMAL_POINT if length > usual and has_decimal_commas(text) else None
+                problem = f"found {columns(length)}, expected {usual} as in the other lines"
+                raise InputError(problem, path=self.path, line=line, hint=hint)
         return np.array([row.numbers for row in self.rows], np.float64)
 
 
@@ -84,13 +82,10 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
 
-    `expected` says in messages what the file should be.
-
-    Raises:
-        InputError: the file is missing, no file, or has more than `most` bytes.
+    Raises InputError where it is missing, not `expected`, as messages call it, or has more than `most` bytes.
     """
     check_file(path, expected, pipe=True)
-    try:
+    with reading(path):
         if not is_substitution(path):
             check_length(path, most)
             return path.read_bytes()
@@ -101,8 +96,6 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
                 raise _too_long(f"more than {most / 1e6:.1f} MB", most, path)
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
 
 
 def read_lines(
@@ -133,10 +126,8 @@ def read_lines(
 def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
-    The arguments are those of read_text.
-
-    Raises:
-        InputError: with the line, for a word that is no finite number; also for a file without numbers.
+    The arguments are those of read_text. Raises InputError with the line for a word that is no finite number; also for
+    a file without numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
@@ -144,9 +135,7 @@ def read_number_rows(path: Path, *, expected: str = "a text file", most: int = M
 def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT) -> list[WordRow]:
     """Return the words of each line that has any, with points for decimal commas. Raises InputError.
 
-    Args:
-        n_numbers: how many numbers stand at the end of a line.
-        expected, most: see read_text.
+    At the end of a line, n_numbers stand. See read_text for the other arguments.
     """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
@@ -156,11 +145,7 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
 
 
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
-    """Return the numbers of rows of words.
-
-    Raises:
-        InputError: with the line, for a word that is no finite number; also where there are no rows.
-    """
+    """Return the numbers of rows of words. Raises InputError with the line for other words, and for no rows."""
     if not rows:
         raise InputError("the file contains no numbers", path=path)
     parsed = (Row(tuple(parse_number(word, path, line) for word in words), line, text) for line, text, words in rows)
@@ -185,12 +170,8 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
     return any("," in word for word in words) and all(map(is_match, words))
 
 
-def is_number(word: str) -> bool:
-    """Return whether a word is a number, finite or not."""
-    return _to_number(word) is not None
-
-
-def _to_number(word: str) -> float | None:
+def to_number(word: str) -> float | None:
+    """Return the number that a word stands for, finite or not; None for another word."""
     try:
         # float() also takes Python's notation "1_000", but "2024_01" is the name of an image.
         return float(word) if "_" not in word else None
@@ -200,7 +181,7 @@ def _to_number(word: str) -> float | None:
 
 def parse_number(word: str, path: Path, line: int) -> float:
     """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
-    value = _to_number(word)
+    value = to_number(word)
     if value is None or not np.isfinite(value):
         what = "a number" if value is None else "a finite number"
         raise InputError(f'found "{word[:40]}", expected {what}', path=path, line=line)

@@ -39,11 +39,8 @@ def decode_tiff(file: BinaryIO, path: Path) -> NDArray[Any] | None:
         _check_complete(page, os.fstat(file.fileno()).st_size, path)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-            raise InputError(
-                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
-                path=path,
-                hint="Export it as RGB",
-            )
+            problem = f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            raise InputError(problem, path=path, hint="Export it as RGB")
         pixels = _decode_page(page)
         if photometric == _WHITE_IS_ZERO:
             if pixels is None:
@@ -102,16 +99,12 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 
 
 def _check_complete(page: Any, size: int, path: Path) -> None:
-    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels.
-
-    A compressed part that is longer than its pixels would be may expand to a thousand times their size. So may a tile
-    that is far larger than the picture.
-    """
+    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels."""
+    # Such a part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture.
     expanded = math.prod(page.chunks) * page.dtype.itemsize
     longest = 2 * expanded + _LONGEST_EMPTY_PART
     if expanded > 2 * page.nbytes + _LARGEST_EMPTY_PART or max(page.databytecounts, default=0) > longest:
         raise ValueError
-    if any(
-        count == 0 or offset + count > size for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
-    ):
+    parts = zip(page.dataoffsets, page.databytecounts, strict=True)
+    if any(count == 0 or offset + count > size for offset, count in parts):
         raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)

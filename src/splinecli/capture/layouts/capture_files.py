@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
-from splinecli.capture.paths import check_file, find_mode, is_found_file, resolve
+from splinecli.capture.paths import check_file, find_mode, is_found_file, reading, resolve
 from splinecli.errors import InputError
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
@@ -27,28 +27,22 @@ class NoImagesError(InputError):
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
-    parts: list[int | str] = [
-        int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(path.name.casefold()))
-    ]
-    return parts, path.name
+    parts = enumerate(_DIGITS.split(path.name.casefold()))
+    return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
 def list_folder(folder: Path) -> list[Path]:
     """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
 
-    Raises:
-        InputError: the folder is missing, is a file, or cannot be read.
+    Raises InputError where the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
         raise InputError("the folder does not exist", path=folder)
     if not stat.S_ISDIR(mode):
         raise InputError("found a file, expected a folder of images", path=folder)
-    try:
-        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    except OSError as error:
-        raise InputError(f"the folder cannot be read ({error.strerror})", path=folder) from None
-    return sorted(entries, key=natural_key)
+    with reading(folder, "folder"):
+        return sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key)
 
 
 def list_images(
@@ -83,17 +77,14 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
         raise NoImagesError(
-            "the folder contains no images",
-            path=folder,
-            hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images",
+            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images"
         )
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
     """Return the images that a filenames.txt names, one on each line, relative to its folder.
 
-    Raises:
-        InputError: with the line, for an image that does not exist or is named twice; also for an empty list.
+    Raises InputError with the line for an image that does not exist or is named twice; also for an empty list.
     """
     images: dict[Path, int] = {}
     for line, text in enumerate(read_lines(path), start=1):
@@ -114,6 +105,18 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
     if not images:
         raise InputError("the list names no images", path=path)
     return tuple(images)
+
+
+def find_images(
+    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
+) -> tuple[tuple[Path, ...], bool]:
+    """Return the images of a folder, and whether filenames.txt names them; see list_images. Raises NoImagesError."""
+    filenames = find_named(folder, [FILENAMES])
+    if filenames is not None:
+        return read_image_list(filenames), True
+    images = list_images(folder, leave_out_stems=leave_out_stems, leave_out=leave_out)
+    check_not_empty(images, folder)
+    return images, False
 
 
 FILENAMES = "filenames.txt"
@@ -143,33 +146,20 @@ NOT_PHOTOGRAPHS = frozenset({Path(name).stem for name in (*MASK, *AMBIENT, *GROU
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """The files of one capture, with the images in the order of the lights.
+    """The files of one capture, with the images in the order of the lights."""
 
-    Args:
-        layout: name of the arrangement of files, for people.
-        name: name of the capture, in most layouts that of its folder.
-        folder: the folder with the files beside the images.
-        light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no
-            lights are needed.
-        light_intensities: F x 3 text, or None where no file gives them.
-        mask: an image, or None where every pixel counts.
-        boundaries: used instead of a mask: images whose pixels above zero together are the object.
-        ground_truth: a normal map, or None.
-        ambient: an image under none of the lights, or None.
-        others: pictures beside the images whose names say that they are no photographs.
-    """
-
-    layout: str
-    name: str
-    folder: Path
+    layout: str  # name of the arrangement of files, for people
+    name: str  # name of the capture, in most layouts that of its folder
+    folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
+    # F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no lights are needed
     light_directions: Path | None
-    light_intensities: Path | None = None
-    mask: Path | None = None
-    ground_truth: Path | None = None
-    boundaries: tuple[Path, ...] = ()
-    ambient: Path | None = None
-    others: tuple[Path, ...] = ()
+    light_intensities: Path | None = None  # F x 3 text, or None where no file gives them
+    mask: Path | None = None  # an image, or None where every pixel counts
+    ground_truth: Path | None = None  # a normal map, or None
+    boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
+    ambient: Path | None = None  # an image under none of the lights, or None
+    others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
 
 
 @dataclass(frozen=True)
@@ -196,30 +186,6 @@ class Overrides:
 NO_OVERRIDES = Overrides()
 
 
-def gather_files(
-    layout: str,
-    folder: Path,
-    images: tuple[Path, ...],
-    lights: Path | None,
-    overrides: Overrides,
-    *,
-    ground_truth_names: Sequence[str] = GROUND_TRUTH,
-    others: tuple[Path, ...] = (),
-) -> CaptureFiles:
-    """Return the images and lights with the other files of the folder. Files named by the user replace those."""
-    return CaptureFiles(
-        layout=layout,
-        name=folder_name(folder),
-        folder=folder,
-        images=images,
-        light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
-        ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),
-        others=others,
-    )
-
-
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
@@ -233,19 +199,12 @@ def find_lights(folder: Path) -> Path | None:
         return plain
     named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
     if len(named) > 1:
-        raise InputError(
-            f"found {len(named)} light files: {', '.join(path.name for path in named)}",
-            path=folder,
-            hint="Choose one with --lights FILE",
-        )
+        problem = f"found {len(named)} light files: {', '.join(path.name for path in named)}"
+        raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
     return named[0] if named else find_named(folder, LIGHT_POSITIONS)
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
-
-    Raises:
-        InputError: the system refuses to resolve a path with "..".
-    """
+    """Return the folder's own name, also for ".", "..", and a trailing slash; a link keeps its. Raises InputError."""
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"

@@ -36,9 +36,7 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
-    Raises:
-        InputError: the object has no folder of images or several; or no light.txt or no boundary masks, and none are
-            named instead; or its images do not match its lights.
+    Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
     """
     captures = list_captures(folder)
     if captures is None:
@@ -49,25 +47,19 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     images_folder, *more = captures
     if more:
         names = ", ".join(path.name for path in captures)
-        raise InputError(
-            f"found {len(captures)} folders of images ({names}), expected one",
-            path=folder,
-            hint=f"Give one of them, such as {images_folder}",
-        )
+        problem = f"found {len(captures)} folders of images ({names}), expected one"
+        raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
     holder = _parent(images_folder)
     lights = overrides.lights or find_named(holder, [_LIGHTS])
     if lights is None:
-        raise InputError(
-            f"found no {_LIGHTS}, expected the light directions of {images_folder.name}",
-            path=holder,
-            hint="Pass --lights FILE, with one line x y z for each image",
-        )
+        problem = f"found no {_LIGHTS}, expected the light directions of {images_folder.name}"
+        raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
     return CaptureFiles(
-        layout="CyclesPS",
-        name=_name(images_folder),
-        folder=holder,
-        images=_list_numbered(images_folder, len(read_light_directions(lights)), lights),
-        light_directions=lights,
+        "CyclesPS",
+        _name(images_folder),
+        holder,
+        _list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        lights,
         light_intensities=overrides.intensities,
         mask=overrides.mask,
         boundaries=() if overrides.mask else _find_boundaries(holder),
@@ -116,11 +108,8 @@ def _find_boundaries(holder: Path) -> tuple[Path, ...]:
     found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
     missing = [name for name, path in found.items() if path is None]
     if missing:
-        raise InputError(
-            f"found no {' and no '.join(missing)}, expected the masks whose union is the object",
-            path=holder,
-            hint="Pass --mask FILE",
-        )
+        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(problem, path=holder, hint="Pass --mask FILE")
     return tuple(path for path in found.values() if path is not None)
 
 

@@ -1,6 +1,7 @@
 """Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in turn."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from splinecli.capture.formats.film import is_film
@@ -9,19 +10,20 @@ from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     GROUND_TRUTH,
     LIGHT_FILES,
+    LIGHT_INTENSITIES,
+    MASK,
     NO_OVERRIDES,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     NoImagesError,
     Overrides,
     check_not_empty,
+    find_images,
     find_lights,
     find_named,
     folder_name,
-    gather_files,
     list_folder,
     list_images,
-    read_image_list,
 )
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
@@ -40,9 +42,8 @@ PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
-    Raises:
-        InputError: the folder is missing, is a file or contains no images; filenames.txt names an image that
-            does not exist; there is no light file; or a file of the overrides does not exist.
+    Raises InputError where the folder is missing, is a file or contains no images; filenames.txt names an image that
+    does not exist; there is no light file; or a file of the overrides does not exist.
     """
     folder = Path(folder)
     list_folder(folder)  # raises where it is no folder
@@ -59,11 +60,7 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the name of the capture: that of the folder or the film, but in CyclesPS <object>_<kind>.
-
-    Raises:
-        InputError: the system refuses to say what is there.
-    """
+    """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
     return folder.stem if is_film(folder) else cyclesps.capture_name(folder) or folder_name(folder)
 
@@ -85,11 +82,9 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    raise InputError(
-        f"found no capture, expected folders of images with a light file ({LIGHT_FILES})",
-        path=folder,
-        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
-    )
+    problem = f"found no capture, expected folders of images with a light file ({LIGHT_FILES})"
+    hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
+    raise InputError(problem, path=folder, hint=hint)
 
 
 def _subfolders(folder: Path) -> list[Path]:
@@ -119,21 +114,13 @@ def _captures_below(folder: Path) -> list[Path]:
 
 
 def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
-    """Return the capture's files, with the images in natural order or in the order of filenames.txt.
+    """Return the capture's files. Raises InputError where there are no images or lights, or filenames.txt is wrong.
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
-
-    Raises:
-        InputError: the folder contains no images, filenames.txt is wrong, or there is no light file and none is named.
     """
-    filenames = find_named(folder, [FILENAMES])
-    if filenames is not None:
-        images = read_image_list(filenames)
-    else:
-        images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    check_not_empty(images, folder)
+    images, listed = find_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
-    if filenames is not None or len(others) > _MOST_OTHERS * len(images):
+    if listed or len(others) > _MOST_OTHERS * len(images):
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
@@ -145,22 +132,41 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
     layout, ground_truth = "plain folder", GROUND_TRUTH
-    if filenames is not None and find_named(folder, ["light_directions.txt"]) is not None:
+    if listed and find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    return gather_files(layout, folder, images, lights, overrides, ground_truth_names=ground_truth, others=others)
+    return _gather(layout, folder, images, lights, overrides, ground_truth, others)
 
 
 def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """Return the files of a capture of PSBox, or None for another layout: its images are in a folder of their own.
-
-    Raises:
-        InputError: that folder contains no images.
-    """
+    """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
     lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
     objects = folder / PSBOX_IMAGES
     if lights is None or not is_folder(objects):
         return None
     images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     check_not_empty(images, objects)
-    return gather_files("PSBox", folder, images, lights, overrides)
+    return _gather("PSBox", folder, images, lights, overrides)
+
+
+def _gather(
+    layout: str,
+    folder: Path,
+    images: tuple[Path, ...],
+    lights: Path | None,
+    overrides: Overrides,
+    ground_truth: Sequence[str] = GROUND_TRUTH,
+    others: tuple[Path, ...] = (),
+) -> CaptureFiles:
+    """Return the images and lights with the other files of the folder. Files named by the user replace those."""
+    return CaptureFiles(
+        layout,
+        folder_name(folder),
+        folder,
+        images,
+        light_directions=lights if overrides.needs_lights else None,
+        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        mask=overrides.mask or find_named(folder, MASK),
+        ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
+        others=others,
+    )

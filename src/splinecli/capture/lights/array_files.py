@@ -30,13 +30,9 @@ _XML = re.compile(
 
 
 def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
-    """Return the rows of the matrix of lights; the lines count them from 1.
+    """Return the rows of the matrix of lights, n_images of them if it is known; the lines count them from 1.
 
-    Args:
-        n_images: the number of lights that is expected, if it is known.
-
-    Raises:
-        InputError: the file is damaged, or of its matrices not one alone can be the lights.
+    Raises InputError where the file is damaged, or not one alone of its matrices can be the lights.
     """
     suffix = path.suffix.lower()
     if suffix == ".npy":
@@ -46,8 +42,7 @@ def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
         array = _choose(read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
     if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
         raise InputError(
-            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3",
-            path=path,
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3", path=path
         )
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
     return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
@@ -61,11 +56,9 @@ def _choose(matrices: Mapping[str, Array], path: Path, n_images: int | None) -> 
     if len(lights) == 1:
         return next(iter(lights.values()))
     sizes = ", ".join(f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items())
-    raise InputError(
-        f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x N{f': {sizes}' if sizes else ''}",
-        path=path,
-        hint="Write the light directions into a text file, a line x y z for each image",
-    )
+    problem = f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x N{f': {sizes}' if sizes else ''}"
+    hint = "Write the light directions into a text file, a line x y z for each image"
+    raise InputError(problem, path=path, hint=hint)
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:

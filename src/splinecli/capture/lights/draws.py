@@ -40,10 +40,8 @@ def draw_lights(
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        raise UsageError(
-            f"{n_lights} lights were requested, but the capture has {available}",
-            hint=f"Ask for at most {available} lights",
-        )
+        problem = f"{n_lights} lights were requested, but the capture has {available}"
+        raise UsageError(problem, hint=f"Ask for at most {available} lights")
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -74,8 +72,7 @@ class DrawsFile:
     def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
         """Raise InputError, with the line, for a draw that does not fit a capture under these lights (F, 3).
 
-        Args:
-            skipped: number of lights at the start that no draw may name.
+        No draw may name the first `skipped` lights.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
@@ -94,14 +91,10 @@ class DrawsFile:
 def read_draws(path: Path) -> DrawsFile:
     """Return the draws of a text file. Each line is one draw: light indices from 0, separated by spaces or commas.
 
-    "#" comments and blank lines are skipped.
-
-    Raises:
-        InputError: with the line, for a word that is no light index, a repeated index, fewer than three lights,
-            or a number of lights that differs from the first draw; also for a file without draws.
+    "#" comments and blank lines are skipped. Raises InputError with the line for a word that is no light index, a
+    repeated index, fewer than three lights, or another number than in the first draw; also for a file without draws.
     """
-    draws: list[Draw] = []
-    lines: list[int] = []
+    draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
         words = split_words(text.partition("#")[0])
         if words:
@@ -119,10 +112,8 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    raise InputError(
-        f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws",
-        hint="Choose more lights, or lights that surround the viewing direction",
-    )
+    problem = f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws"
+    raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
 
 
 def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:

@@ -13,8 +13,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.paths import is_substitution
 from splinecli.errors import InputError
 
-NEAR_DEG = 2.0
-"""The change of a light direction across the object above which distant lights carry a warning."""
+NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
 
 INSIDE = 0.5
 """A lamp is refused if its distance from the middle of the object is below this share of the smaller of the object's
@@ -34,13 +33,9 @@ UNIT_HINT = (
 
 
 def check_distances(lamps: NearLamps, mask: NDArray[np.bool_], positions: Path | None) -> list[CaptureWarning]:
-    """Return a warning about lamps that are hardly possible over an object with this mask (H, W), or an empty list.
+    """Warn of lamps that are hardly possible over an object with this mask (H, W), from a file of positions, if any.
 
-    Args:
-        positions: the file of the positions, for the message; None where there is none.
-
-    Raises:
-        InputError: a lamp would be inside the object, or in front of it.
+    Raises InputError where a lamp would be inside the object, or in front of it.
     """
     sizes, middle = lamps.extent(mask)
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
@@ -56,12 +51,9 @@ def check_distances(lamps: NearLamps, mask: NDArray[np.bool_], positions: Path |
 
 
 def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]) -> list[CaptureWarning]:
-    """Warn that lights count as distant although a file has their positions; with a list of one warning or none.
+    """Warn that lights count as distant over a mask (H, W), although a file has their positions.
 
-    Args:
-        positions: the file.
-        lamps: the lamps of the file, or None where their scale is unknown.
-        mask: (H, W), the object.
+    The lamps of the file are None where their scale is unknown.
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
@@ -82,7 +74,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     if path.suffix.lower() in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES) or is_substitution(path):
         return []
     try:
-        vectors = read_light_rows(path, expected="x y z", n_numbers=3).numbers.as_array()
+        vectors = read_light_rows(path, expected="x y z", n_numbers=3).as_array()
     except InputError:
         return []  # a file of angles
     vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]

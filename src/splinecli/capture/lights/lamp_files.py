@@ -1,22 +1,26 @@
 """The files and options that say where near lamps are, and how large a pixel is."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import is_number, read_lines, read_number_rows
+from splinecli.capture.formats.text import read_lines, read_number_rows, to_number
 from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
 from splinecli.capture.lights.light_files import read_light_positions
-from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
-from splinecli.capture.window import Window
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
+
+if TYPE_CHECKING:
+    from splinecli.capture.source import CaptureSource
 
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
@@ -30,24 +34,16 @@ SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel
 class LampOptions:
     """What the user says about near lamps. All lengths have the same unit, such as millimetres.
 
-    Args:
-        positions: a file of lamp positions, which replaces the light file.
-        distance: the distance of all lamps from the middle of the object, in their directions.
-        pixel_size: the width of a pixel on the object's mean plane.
-        scales_surface: whether the pixel size is given for the surface, so that it needs no lamps.
-        object_width: the width of the object, from the first to the last column of the mask.
-        camera_matrix: a file of the 3 x 3 camera matrix in pixels.
-
     Raises:
         UsageError: a number is not above 0, or two options contradict each other.
     """
 
-    positions: str | None = None
-    distance: float | None = None
-    pixel_size: float | None = None
-    scales_surface: bool = False
-    object_width: float | None = None
-    camera_matrix: str | None = None
+    positions: str | None = None  # a file of lamp positions, which replaces the light file
+    distance: float | None = None  # of all lamps from the middle of the object, in their directions
+    pixel_size: float | None = None  # the width of a pixel on the object's mean plane
+    scales_surface: bool = False  # whether the pixel size is given for the surface, so that it needs no lamps
+    object_width: float | None = None  # from the first to the last column of the mask
+    camera_matrix: str | None = None  # a file of the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
         for name in ("distance", "pixel_size", "object_width"):
@@ -80,61 +76,33 @@ NO_LAMP_OPTIONS = LampOptions()
 
 @dataclass(frozen=True, eq=False)
 class LampFiles:
-    """What files and options say of near lamps, before the lights and the images are read.
+    """What files and options say of near lamps, before the lights and the images are read."""
 
-    Args:
-        positions: the file of positions, or None where `distance` puts the lamps in the light directions.
-        distance: see LampOptions.
-        pixel_size, object_width: the scale; see LampOptions. Both are None where it is unknown.
-        camera_matrix: (3, 3), or None for an orthographic camera.
-        lobes: the file of the lamps' lobes, or None.
-        stamp: of the files that were found, from before they were read.
-        used: whether the capture uses the lamps. If not, they are only compared with distant lights.
-    """
-
-    positions: Path | None
-    distance: float | None
+    positions: Path | None  # the file of positions, or None where `distance` puts the lamps in the light directions
+    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
     pixel_size: float | None
     object_width: float | None
-    camera_matrix: NDArray[np.float64] | None
-    lobes: Path | None
-    stamp: tuple[Any, ...]
-    used: bool
+    camera_matrix: NDArray[np.float64] | None  # (3, 3), or None for an orthographic camera
+    lobes: Path | None  # the file of the lamps' lobes, or None
+    stamp: tuple[Any, ...]  # of the files that were found, from before they were read
+    used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
 
     def in_words(self) -> str:
         """Return the source of the lamps' positions, for people."""
         if not self.used:
             return f"{self.positions} is not used"
-        scale = (
-            f"a pixel is {self.pixel_size:g} wide"
-            if self.pixel_size is not None
-            else f"the object is {self.object_width:g} wide"
-        )
+        what, width = ("a pixel", self.pixel_size) if self.object_width is None else ("the object", self.object_width)
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
-        return f"{where}; {scale}" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
+        return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
-    def over(
-        self,
-        light_directions: NDArray[np.float64],
-        mask: NDArray[np.bool_],
-        window: Window,
-        *,
-        equal: bool,
-        frame: LightFrame = USUAL_FRAME,
-        step: int = 1,
-    ) -> NearLamps | None:
-        """Return the lamps in these directions (F, 3) over what a window reads, with a mask; None without a scale.
-
-        Args:
-            equal: whether all lamps count as equally strong; see NearLamps.of.
-            frame: that of the file of positions.
-            step: the mask has every step-th row and column of what the window reads.
-        """
+    def over(self, source: CaptureSource, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
+        """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
+        window, frame, equal = source.window, source.light_frame, not source.intensities_measured
         if self.positions is not None:
-            positions = read_light_positions(self.positions, len(light_directions), frame)
+            positions = read_light_positions(self.positions, source.n_lights, frame)
         else:
             assert self.distance is not None
-            positions = light_directions * self.distance
+            positions = source.light_directions * self.distance
         pixel_size, camera_matrix = self.pixel_size, self.camera_matrix
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
@@ -152,12 +120,8 @@ class LampFiles:
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
     """Return what the capture's folder and the options say of near lamps; None for nothing.
 
-    A file of positions in the folder is used, unless the user names a file of distant lights. Beside such a file, and
-    where nothing tells the scale, positions are found but not used.
-
-    Args:
-        folder: the folder of the capture.
-        lights: the light file that the user names.
+    A file of positions in the folder is used, unless the user names a file `lights` of distant lights. Beside such a
+    file, and where nothing tells the scale, positions are found but not used.
 
     Raises:
         InputError: a file is wrong, or positions are the only lights and their scale is unknown.
@@ -166,10 +130,8 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     positions, used = _find_positions(folder, lights, options)
     if positions is None and options.distance is None:
         if options.given is not None:
-            raise UsageError(
-                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
-                hint="Add --light-positions FILE or --light-distance D, or leave it out",
-            )
+            problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
+            raise UsageError(problem, hint="Add --light-positions FILE or --light-distance D, or leave it out")
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
     matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
@@ -182,16 +144,8 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
         raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
-    return LampFiles(
-        positions,
-        options.distance,
-        pixel_size,
-        options.object_width,
-        None if matrix_file is None else read_camera_matrix(matrix_file),
-        lobes,
-        stamp,
-        used and scaled,
-    )
+    matrix, width = None if matrix_file is None else read_camera_matrix(matrix_file), options.object_width
+    return LampFiles(positions, options.distance, pixel_size, width, matrix, lobes, stamp, used and scaled)
 
 
 def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
@@ -212,11 +166,8 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """Return the 3 x 3 numbers of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
-        raise InputError(
-            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
-            path=path,
-            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
-        )
+        problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
+        raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
     return matrix
 
 
@@ -235,12 +186,8 @@ def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -
     away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
     if away.any():
         lamp = int(away.argmax())
-        raise InputError(
-            f"lamp {lamp + 1} shines away from the object",
-            path=path,
-            line=rows[lamp].line,
-            hint="The directions point from the lamps to the object",
-        )
+        hint = "The directions point from the lamps to the object"
+        raise InputError(f"lamp {lamp + 1} shines away from the object", path=path, line=rows[lamp].line, hint=hint)
     return lobes
 
 
@@ -249,14 +196,11 @@ def _read_pixel_size(path: Path) -> float:
     content = [(line, text.partition("#")[0].strip()) for line, text in lines]
     content = [(line, text) for line, text in content if text] or [(1, "")]
     line, text = content[0]
-    size = float(text) if is_number(text) else 0.0
+    size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
-        raise InputError(
-            f'found "{text[:40]}", expected one number above 0, the width of a pixel',
-            path=path,
-            line=line,
-            hint="Write the number alone; its unit is that of the lamps' positions",
-        )
+        problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
+        hint = "Write the number alone; its unit is that of the lamps' positions"
+        raise InputError(problem, path=path, line=line, hint=hint)
     return size
 
 

@@ -10,18 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import (
-    DECIMAL_POINT,
-    NumberRows,
-    columns,
-    has_decimal_commas,
-    read_number_rows,
-)
+from splinecli.capture.formats.text import DECIMAL_POINT, NumberRows, columns, has_decimal_commas, read_number_rows
 from splinecli.capture.lights.array_files import SUFFIXES, read_array_file
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import (
     COLUMNS,
-    LightRows,
     RowForm,
     check_angles,
     counts_rows,
@@ -55,42 +48,33 @@ def read_light_directions(
             vector or a light below the horizon; also where the count disagrees with the count line or with
             n_images, and for angles that are read as vectors.
     """
-    return directions_of(read_light_table(Path(path), n_images, form).numbers, n_images, frame, form)
+    return lights_of(read_light_table(Path(path), n_images, form), n_images, frame, form)[1]
 
 
-def read_light_table(path: Path, n_images: int | None, form: RowForm) -> LightRows:
+def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Return the rows of a text file or of a file of matrices. Raises InputError; see read_light_directions."""
     if path.suffix.lower() in SUFFIXES:
-        return LightRows(read_array_file(path, n_images))
+        return read_array_file(path, n_images)
     meaning = COLUMNS[form]
     return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
-
-
-def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
-    return _lights_of(table, n_images, frame, form)[1]
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
     """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
 
-    Raises:
-        InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
-            rows that name their images.
+    Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
+    rows that name their images.
     """
-    rows = read_light_table(Path(path), n_images, "positions")
-    positions, _ = _lights_of(rows.numbers, n_images, frame, "positions")
-    if rows.names is not None:
-        raise InputError(
-            f"found the name {rows.names[0]!r}, expected x y z",
-            path=Path(path),
-            line=rows.numbers.rows[0].line,
-            hint="Positions have a line for each image, in the order of the images",
-        )
+    table = read_light_table(Path(path), n_images, "positions")
+    positions, _ = lights_of(table, n_images, frame, "positions")
+    if table.names is not None:
+        problem = f"found the name {table.names[0]!r}, expected x y z"
+        hint = "Positions have a line for each image, in the order of the images"
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     return positions
 
 
-def _lights_of(
+def lights_of(
     table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""
@@ -105,23 +89,18 @@ def _lights_of(
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     places = [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))]
-    return vectors, unit_directions(vectors, table.path, lines, places, of_lamps=form == "positions")
+    return vectors, unit_directions(vectors, table.path, lines, places, lamps=form == "positions")
 
 
 def unit_directions(
-    vectors: NDArray[np.float64],
-    path: Path,
-    lines: Sequence[int | None],
-    places: Sequence[str],
-    *,
-    of_lamps: bool = False,
+    vectors: NDArray[np.float64], path: Path, lines: Sequence[int | None], places: Sequence[str], lamps: bool = False
 ) -> NDArray[np.float64]:
     """Return vectors (F, 3) at unit length.
 
     Args:
         vectors: of any length.
         places: words for the place of each vector on its line.
-        of_lamps: whether the vectors are positions of lamps, for messages.
+        lamps: whether the vectors are positions of lamps, for messages.
 
     Raises:
         InputError: a zero vector, or a light that is not above the horizon.
@@ -133,15 +112,12 @@ def unit_directions(
     directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            raise InputError(
-                f"found a zero vector{place}, expected a {'lamp position' if of_lamps else 'light direction'}",
-                path=path,
-                line=line,
-                hint="Write x y z towards the light, or remove the line and its image",
-            )
+            problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
+            hint = "Write x y z towards the light, or remove the line and its image"
+            raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
             raise InputError(
-                f"found a {'lamp behind the object' if of_lamps else 'light below the horizon'}{place}"
+                f"found a {'lamp behind the object' if lamps else 'light below the horizon'}{place}"
                 f" (z = {vector[2]:g}), expected z > 0",
                 path=path,
                 line=line,
@@ -155,10 +131,8 @@ def unit_directions(
 def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    A single number for each light is used for all three channels.
-
-    Raises:
-        InputError: as for read_light_directions; also with the line, for an intensity that is no usable number.
+    A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
+    with the line for an intensity that is no usable number.
     """
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
@@ -178,11 +152,9 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
     """Return the table in the order of a first column that counts the lights, and without that column."""
     rows = table.rows
-    if {len(row.numbers) for row in rows} != {n_columns + 1} or n_images not in (None, len(rows)):
-        return table
-    if n_images is None and len(rows) == n_columns:
-        return table  # one light in each column
-    if counts_rows([row.numbers[0] for row in rows]) is None:
+    fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
+    in_columns = n_images is None and len(rows) == n_columns  # one light in each
+    if not fits or in_columns or counts_rows([row.numbers[0] for row in rows]) is None:
         return table
     ordered = sorted(rows, key=lambda row: row.numbers[0])
     return replace(table, rows=tuple(row._replace(numbers=row.numbers[1:]) for row in ordered))
@@ -202,12 +174,8 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if not count.is_integer():
         expected = columns(len(following[0].numbers))
         raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
-    raise InputError(
-        f"the count line says {count:.0f}, but {len(following)} rows follow",
-        path=table.path,
-        line=first.line,
-        hint="Correct the count or leave it out",
-    )
+    problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
+    raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
 
 
 def _one_light_a_row(
@@ -215,8 +183,7 @@ def _one_light_a_row(
 ) -> tuple[NDArray[np.float64], bool]:
     """Return the numbers with one light in each row, and whether the file has one light in each column.
 
-    Args:
-        names: the possible counts of numbers for a light, each with its meaning.
+    `names` has the possible counts of numbers for a light, each with its meaning.
     """
     values = table.as_array()
     n_columns = values.shape[1]
@@ -225,20 +192,15 @@ def _one_light_a_row(
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.rows[0].text
         decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
-        raise InputError(
-            f"found {columns(n_columns)}, expected {expected}",
-            path=table.path,
-            line=table.rows[0].line,
-            hint=DECIMAL_POINT if decimal_commas else None,
-        )
+        problem = f"found {columns(n_columns)}, expected {expected}"
+        hint = DECIMAL_POINT if decimal_commas else None
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
-    raise InputError(
-        f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image",
-        path=table.path,
-        hint="The file needs one line for each image, in the order of the images",
-    )
+    problem = f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image"
+    hint = "The file needs one line for each image, in the order of the images"
+    raise InputError(problem, path=table.path, hint=hint)
 
 
 def rows_text(values: NDArray[np.float64]) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_rows
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
 
 Array = NDArray[np.float64]
 
@@ -43,8 +43,7 @@ class Factors:
     # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
     # matrices is one between images, as a share of the mean brightness
     matrix: Array
-    # (F,), the root mean square of what the factors do not explain of each image, in the same unit
-    image_residuals: Array
+    image_residuals: Array  # (F,), the root mean square of what the factors do not explain of each image, in this unit
     intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
@@ -76,11 +75,8 @@ class Factors:
         return self._fit_intensities(light_directions)[0]
 
     def _fit_intensities(self, light_directions: Array) -> tuple[Array, Array]:
-        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give.
-
-        Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (semi-calibrated photometric
-        stereo, Cho et al., TPAMI 2018).
-        """
+        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
+        # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
         prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
         intensities = np.ones(light_directions.shape[:2])
         for _ in range(_INTENSITY_ROUNDS):
@@ -124,8 +120,8 @@ def find_factors(observations: NDArray[np.floating], *, intensities_known: bool 
 
 def random_misfits(factors: Factors, light_directions: Array) -> Array:
     """Return the misfits of the lights (F, 3) in random orders, in rising order."""
-    orders = np.tile(np.arange(len(light_directions)), (RANDOM_ORDERS, 1))
-    orders = np.random.default_rng(0).permuted(orders, axis=1)
+    given = np.tile(np.arange(len(light_directions)), (RANDOM_ORDERS, 1))
+    orders = np.random.default_rng(0).permuted(given, axis=1)
     if factors.intensities_known:
         # One basis serves all orders, which saves most of the time.
         return np.sort(factors.distances(np.linalg.qr(light_directions)[0][orders]))
@@ -163,9 +159,7 @@ def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
     for share in DARK_SHARES:
-        chosen = lit_rows(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
-        values = observations[chosen].astype(np.float64)
-        values = values / values.max(axis=1, keepdims=True)
+        _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
         kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:

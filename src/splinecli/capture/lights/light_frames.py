@@ -27,16 +27,14 @@ EXCHANGED = "exchanged"  # word for files whose first column is y and whose seco
 class LightFrame:
     """The frame of a light file."""
 
-    # of x, y and z, 1 for right, up and to the camera, -1 for left, down and away
-    signs: tuple[int, int, int] = (1, 1, 1)
+    signs: tuple[int, int, int] = (1, 1, 1)  # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
     exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
 
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the camera."""
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
-        matrix: NDArray[np.float64] = np.diag(self.signs).astype(np.float64)[:, order]
-        return matrix
+        return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
 
     def __str__(self) -> str:
         """Return the value of --light-frame, such as "x-left,y-down"; only what differs from the usual frame."""
@@ -54,10 +52,8 @@ class LightFrame:
 
     def after(self, first: LightFrame) -> LightFrame:
         """Return the frame that stands for `first` and then this one."""
-        matrix = self.matrix @ first.matrix
-        exchanged = self.exchanged != first.exchanged
-        x, y, z = (int(sign) for sign in matrix.sum(axis=1))
-        return LightFrame((x, y, z), exchanged)
+        x, y, z = (int(sign) for sign in (self.matrix @ first.matrix).sum(axis=1))
+        return LightFrame((x, y, z), self.exchanged != first.exchanged)
 
 
 USUAL_FRAME = LightFrame()  # x right, y up, z to the camera, as in docs/files-and-frames.md
@@ -71,10 +67,7 @@ PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in pro
 def parse_light_frame(text: str | None) -> LightFrame:
     """Return the frame of a list such as "x-left,y-down,exchanged"; the usual one of None.
 
-    Axes that the list does not name are as usual.
-
-    Raises:
-        UsageError: a word is unknown, or an axis comes twice.
+    Axes that the list does not name are as usual. Raises UsageError for an unknown word, and an axis that comes twice.
     """
     if text is None:
         return USUAL_FRAME

@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import NumberRows, is_number, parse_rows, read_rows_of_words
+from splinecli.capture.formats.text import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
@@ -61,24 +61,8 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
                 hint = "The elevation counts from the image plane: 90 is the direction of the camera"
             raise InputError(problem, path=table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
-        raise InputError(
-            "no angle is above 2 pi, so they look like radians, expected degrees",
-            path=table.path,
-            line=table.rows[0].line,
-            hint="Multiply them by 180 / pi = 57.2958",
-        )
-
-
-def refuse_zenith(header: list[str], path: Path, line: int) -> None:
-    """Raise InputError for a header with an angle from the camera axis in place of the elevation."""
-    found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
-    if found is not None:
-        raise InputError(
-            f'found the column "{found[:40]}", expected azimuth and elevation',
-            path=path,
-            line=line,
-            hint="The elevation is 90 minus the angle from the camera axis",
-        )
+        problem = "no angle is above 2 pi, so they look like radians, expected degrees"
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
 
 
 def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,16 +107,7 @@ _ANGLE = re.compile(r"(az|el|alt)")
 _AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
 
 
-@dataclass(frozen=True)
-class LightRows:
-    """The rows of a light file."""
-
-    numbers: NumberRows  # without a header and without names
-    # the name of each row's image, without folders; None where the rows begin with numbers
-    names: tuple[str, ...] | None = None
-
-
-def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
+def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
     """Return the rows of a text file, without "#" comments, blank lines and a header (a first row without numbers).
 
     Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are the light. A header
@@ -147,25 +122,26 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
-    if len(rows) > 1 and not any(is_number(word) for word in rows[0][2]):
+    if len(rows) > 1 and all(to_number(word) is None for word in rows[0][2]):
         line, _, header = rows.pop(0)
         order = _order_of(header[-n_numbers:])
-        if n_numbers == len(_ANGLES):
-            refuse_zenith(header, path, line)
+        found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+        if found is not None and n_numbers == len(_ANGLES):
+            problem = f'found the column "{found[:40]}", expected azimuth and elevation'
+            hint = "The elevation is 90 minus the angle from the camera axis"
+            raise InputError(problem, path=path, line=line, hint=hint)
     # A count may stand before rows with names.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
-    if body and all(len(words) > n_numbers and not is_number(words[0]) for _, _, words in body):
-        names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
-        without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
-        return LightRows(_reordered(parse_rows(without_names, path), order), names)
-    if n_numbers == len(_AXES) and body and all(_is_named_angles(words) for *_, words in body):
-        raise InputError(
-            "found a name and 2 numbers, expected a name and 3 (x y z)",
-            path=path,
-            line=body[0][0],
-            hint=AZEL_HINT,
-        )
-    return LightRows(_reordered(parse_rows(rows, path), order))
+    if body and all(to_number(words[0]) is None for *_, words in body):
+        if all(len(words) > n_numbers for *_, words in body):
+            names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
+            without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
+            return replace(_reordered(parse_rows(without_names, path), order), names=names)
+        angles = [words[1:] for *_, words in body if None not in map(to_number, words[1:])]
+        if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [len(_ANGLES)]:
+            problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
+            raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
+    return _reordered(parse_rows(rows, path), order)
 
 
 def _order_of(header: list[str]) -> list[int]:
@@ -179,22 +155,13 @@ def _order_of(header: list[str]) -> list[int]:
 
 
 def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
-    """Return rows whose last numbers are in the order given."""
     first = -len(order)
-    if order == sorted(order):
-        return table
-    rows = (
-        row._replace(numbers=(*row.numbers[:first], *(row.numbers[first:][i] for i in order)))
-        if len(row.numbers) >= len(order)
-        else row
-        for row in table.rows
-    )
-    return replace(table, rows=tuple(rows))
 
+    def reorder(row: Row) -> Row:
+        last = row.numbers[first:]
+        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order))) if len(last) == -first else row
 
-def _is_named_angles(words: list[str]) -> bool:
-    name, *numbers = words
-    return not is_number(name) and len(numbers) == len(_ANGLES) and all(map(is_number, numbers))
+    return replace(table, rows=tuple(map(reorder, table.rows)))
 
 
 def image_name(text: str, numbers: list[str]) -> str:

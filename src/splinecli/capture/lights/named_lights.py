@@ -7,7 +7,7 @@ the folder are matched to them by base name, then by name without suffix, then b
 import json
 import reprlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_files import directions_of, read_light_table, unit_directions
+from splinecli.capture.lights.light_files import lights_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError
@@ -41,23 +41,17 @@ class NamedLights:
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
 
-        Images that no light names are left out, unless they are matched by order.
-
-        Raises:
-            InputError: two lights have one name, or neither the names nor the number of images fit.
+        Images that no light names are left out, unless they are matched by order. Raises InputError where two lights
+        have one name, or neither the names nor the number of images fit.
         """
         lines: dict[str, int | None] = {}
         for name, line in zip(self.names, self.lines, strict=True):
             if name.casefold() in lines:
                 raise InputError(f'a second light for the image "{name}"', path=self.path, line=line)
             lines[name.casefold()] = line
-        keys: tuple[tuple[str, Callable[[str], str]], ...] = (
-            ("name", str.casefold),
-            ("name without suffix", lambda name: Path(name).stem.casefold()),
-        )
-        for how, key in keys:
-            by_key = {key(image.name): image for image in reversed(images)}
-            wanted = [key(name) for name in self.names]
+        for how, part in (("name", "name"), ("name without suffix", "stem")):
+            by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
+            wanted = [getattr(Path(name), part).casefold() for name in self.names]
             if len(set(wanted)) == len(wanted) and all(name in by_key for name in wanted):
                 return tuple(by_key[name] for name in wanted), how
         if len(images) == len(self.names):
@@ -78,19 +72,16 @@ def read_lights(
 ) -> NamedLights | Array:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
-    Args:
-        frame: the frame of the file. That of a JSON file is relative to AliceVision's, which has y down and z away.
-
-    Raises:
-        InputError: see read_light_directions.
+    The frame of a JSON file is relative to AliceVision's, which has y down and z away. Raises InputError; see
+    read_light_directions.
     """
     if path.suffix.lower() in SUFFIXES:
         return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
-    rows = read_light_table(path, n_images, form)
-    if rows.names is None:
-        return directions_of(rows.numbers, n_images, frame, form)
-    lines = tuple(row.line for row in rows.numbers.rows)
-    return NamedLights(path, rows.names, lines, directions_of(rows.numbers, None, frame, form))
+    table = read_light_table(path, n_images, form)
+    _, directions = lights_of(table, n_images if table.names is None else None, frame, form)
+    if table.names is None:
+        return directions
+    return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions)
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
@@ -103,12 +94,8 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
     if not count.isdecimal():
         raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
     if int(count[:_MOST_DIGITS]) != len(rows):
-        raise InputError(
-            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
-            path=path,
-            line=first,
-            hint="Correct the number, or restore the missing lines",
-        )
+        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
+        raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
     if not rows:
         raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
@@ -126,10 +113,7 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
 
 
 def _read_json(path: Path, frame: LightFrame) -> NamedLights:
-    """Read AliceVision's format.
-
-    {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
-    """
+    """Read AliceVision's lights: objects with viewId, type (directional), direction [x, y, z], intensity [r, g, b]."""
     try:
         document = parse_json("\n".join(read_lines(path)))
     except json.JSONDecodeError as error:
@@ -145,40 +129,30 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
             raise InputError(f"light {number} is not an object", path=path)
         kind = light.get("type", "directional")
         if kind != "directional":
-            raise InputError(
-                f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'",
-                path=path,
-                hint="Calibrate for distant lights, one direction a light",
-            )
+            problem = f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'"
+            raise InputError(problem, path=path, hint="Calibrate for distant lights, one direction a light")
         names.append(image_name(str(light.get("viewId", number)), []))
         vectors.append(_three_numbers(light, "direction", number, path))
         if "intensity" in light:
             intensities.append(_three_numbers(light, "intensity", number, path))
-            if min(intensities[-1]) <= 0:
-                raise InputError(
-                    f"light {number} has the intensity {min(intensities[-1]):g}, expected above 0", path=path
-                )
+            if (least := min(intensities[-1])) <= 0:
+                raise InputError(f"light {number} has the intensity {least:g}, expected above 0", path=path)
     if intensities and len(intensities) != len(lights):
-        raise InputError(
-            f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none", path=path
-        )
-    directions = unit_directions(
-        np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0,  # no -0
-        path,
-        [None] * len(lights),
-        [f" as light {number}" for number in range(1, len(lights) + 1)],
-    )
-    return NamedLights(
-        path, tuple(names), (None,) * len(names), directions, np.array(intensities) if intensities else None
-    )
+        problem = f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none"
+        raise InputError(problem, path=path)
+    turned = np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0  # no -0
+    lines, places = (None,) * len(lights), [f" as light {number}" for number in range(1, len(lights) + 1)]
+    directions = unit_directions(turned, path, lines, places)
+    return NamedLights(path, tuple(names), lines, directions, np.array(intensities) if intensities else None)
 
 
 def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
     values = light.get(key)
-    good = isinstance(values, list) and len(values) == 3
-    if not good or not all(
-        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-        for value in values or ()
-    ):
+    numbers = [
+        float(value)
+        for value in (values if isinstance(values, list) else ())
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    ]
+    if len(numbers) != 3 or len(values or ()) != 3:
         raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
-    return [float(value) for value in values or ()]
+    return numbers

@@ -26,28 +26,20 @@ _LEAST_SHARE = 0.05
 class NearLamps:
     """F lamps as points of light, over an image of known scale.
 
-    Args:
-        positions: (F, 3), in any unit, in front of the object's mean plane (z > 0).
-        pixel_size: the width of a pixel on the object's mean plane, in the unit of the positions.
-        middle: row and column of the origin, in pixels of what was read.
-        reference_distances: (F,), the distances along each lamp's axis at which the observations' light intensities
-            hold. See `of`.
-        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        points: (P, 3), the surface in the capture's pixels, in the unit of the positions. None while it is unknown.
-        lobes: (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its
-            intensity is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section
-            2.1). None for lamps that shine alike in all directions.
-
     Raises:
         InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
     """
 
-    positions: Floats
-    pixel_size: float
-    middle: tuple[float, float]
+    positions: Floats  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
+    pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
+    middle: tuple[float, float]  # row and column of the origin, in pixels of what was read
+    # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
     reference_distances: Floats
-    camera_matrix: Floats | None = None
-    points: NDArray[np.float32] | None = None
+    camera_matrix: Floats | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    points: NDArray[np.float32] | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
+    # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
+    # is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
+    # lamps that shine alike in all directions
     lobes: Floats | None = None
 
     def __post_init__(self) -> None:
@@ -85,13 +77,8 @@ class NearLamps:
 
     def within(self, left: float, top: float, step: int, camera_matrix: Floats | None) -> NearLamps:
         """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
-        row, column = self.middle
-        return replace(
-            self,
-            pixel_size=step * self.pixel_size,
-            middle=((row - top) / step, (column - left) / step),
-            camera_matrix=camera_matrix,
-        )
+        middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
+        return replace(self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the lamps as JSON values: their distances from the origin, and the scale."""
@@ -112,12 +99,8 @@ class NearLamps:
     def choose_lights(self, positions: Sequence[int]) -> NearLamps:
         """Return some of the lamps, in the order given."""
         chosen = list(positions)
-        return replace(
-            self,
-            positions=self.positions[chosen],
-            reference_distances=self.reference_distances[chosen],
-            lobes=None if self.lobes is None else self.lobes[chosen],
-        )
+        lobes, distances = None if self.lobes is None else self.lobes[chosen], self.reference_distances[chosen]
+        return replace(self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes)
 
     def choose_pixels(self, rows: slice | NDArray[np.integer]) -> NearLamps:
         """Return the lamps with the surface in some of the pixels."""
@@ -143,8 +126,7 @@ class NearLamps:
         rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
         row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
         directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
-        largest: Floats = angle_between_deg(directions, directions[-1]).max(axis=0)
-        return largest
+        return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
 
     def light_at(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).

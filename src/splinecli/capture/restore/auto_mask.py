@@ -36,8 +36,6 @@ def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
     mask = cv2.drawContours(np.zeros(brightness.shape, np.uint8), outline, -1, 1, cv2.FILLED) > 0
     share = float(mask.mean())
     if not largest or not _SMALLEST <= share <= _LARGEST:
-        raise InputError(
-            f"no mask was found: the area brighter than the background covers {100 * share:.1f} % of the picture",
-            hint="Paint a mask, white on the object, and pass it with --mask FILE",
-        )
+        problem = f"no mask was found: the area brighter than the background covers {100 * share:.1f} % of the picture"
+        raise InputError(problem, hint="Paint a mask, white on the object, and pass it with --mask FILE")
     return np.asarray(mask)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import fit_robustly, lit_rows, shade, shadow_weights
+from splinecli.capture.robust_fit import fit_robustly, lit_values, shade, shadow_weights
 from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
@@ -86,15 +86,10 @@ def _choose_pixels(
     n_lights = observations.shape[1]
     if n_lights < MIN_LIGHTS:
         return None
-    chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
-    known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
+    chosen, values = lit_values(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+    known = np.ones(values.shape, np.bool_) if missing is None else ~missing[chosen]
     enough = known.sum(axis=1) >= MIN_LIGHTS
-    known, chosen = known[enough], chosen[enough]
-    values = observations[chosen].astype(np.float64)
-    if len(values) < _MIN_PIXELS:
-        return None
-    values /= values.max(axis=1, keepdims=True)
-    return chosen, values, known
+    return (chosen[enough], values[enough], known[enough]) if enough.sum() >= _MIN_PIXELS else None
 
 
 def _alternate(values: Array, known: NDArray[np.bool_], lights: Array) -> Array | None:

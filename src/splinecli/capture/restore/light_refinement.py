@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from splinecli.capture.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
-from splinecli.capture.robust_fit import fit_robustly, lit_rows
+from splinecli.capture.robust_fit import fit_robustly, lit_values
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -111,10 +111,7 @@ def would_refine(
 ) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
-    It is cheap where the given lights (F, 3) fit well.
-
-    Args:
-        factors: of the observations; see find_factors.
+    It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
     if factors is None or factors.misfits(light_directions[None])[0] < ROUGH_MISFIT:
         return None
@@ -163,12 +160,9 @@ def refine_lights(
         light_directions: (F, 3), unit.
         error_deg, intensities_known: see refine_capture.
     """
+    intensity_error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(
-        observations,
-        light_directions,
-        error_deg,
-        intensity_error=0.0 if intensities_known else INTENSITY_ERROR,
-        worth_pixels=_WORTH_PIXELS,
+        observations, light_directions, error_deg, intensity_error=intensity_error, worth_pixels=_WORTH_PIXELS
     )
     if fit is None:
         return None
@@ -219,11 +213,8 @@ def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
     if observations.shape[1] < MIN_LIGHTS:
         return None
-    chosen = lit_rows(observations, _DARK_SHARE, _MAX_PIXELS)
-    if len(chosen) < _MIN_PIXELS:
-        return None
-    values = observations[chosen].astype(np.float64).clip(min=0)
-    return np.asarray(values / values.max(axis=1, keepdims=True))
+    _, values = lit_values(observations, _DARK_SHARE, _MAX_PIXELS)
+    return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 
 def _misfit(values: Array, normals: Array, lights: Array, lit: Array) -> float:
@@ -239,13 +230,7 @@ def _prior(light_directions: Array, error_deg: float | Array, intensity_error: f
 
 
 def _move_lights(
-    values: Array,
-    normals: Array,
-    weights: Array,
-    lights: Array,
-    given: Array,
-    precision: Array,
-    worth_pixels: float,
+    values: Array, normals: Array, weights: Array, lights: Array, given: Array, precision: Array, worth_pixels: float
 ) -> Array:
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, shade, shadow_weights
 
-ITERATIONS = 16
-"""Fits to a pixel. More change the restored values by less than the fit's own error."""
+ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 
 RAISED_WEIGHT = np.float32(0.1)
 """Weight of an observation that the last fit raised; one that the fit meets has 50. It determines nothing but what the
@@ -38,9 +37,7 @@ def in_any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def restore_saturated(
-    observations: NDArray[np.float32],
-    saturated: NDArray[np.bool_],
-    lights: NDArray[np.float64] | LightsOf,
+    observations: NDArray[np.float32], saturated: NDArray[np.bool_], lights: NDArray[np.float64] | LightsOf
 ) -> NDArray[np.bool_] | None:
     """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
 
@@ -68,10 +65,8 @@ def _restored(
 ) -> NDArray[np.float32]:
     scale = stored.max(axis=1, keepdims=True)
     scale[scale <= 0] = 1
-    lowest = stored / scale
-    values = lowest
-    lit = shadow_weights(lowest)
-    weights = lit
+    values = lowest = stored / scale
+    weights = lit = shadow_weights(lowest)
     for _ in range(ITERATIONS):
         predicted = shade(fit_scaled_normals(values, weights, lights), lights)
         residuals = predicted - lowest
@@ -79,5 +74,4 @@ def _restored(
         values = np.where(raised, np.minimum(predicted, MAX_BRIGHTENING), lowest)
         weights = lit * np.where(raised, RAISED_WEIGHT, absolute_weights(residuals))
     # Rounding must not make a value darker than stored.
-    restored: NDArray[np.float32] = np.where(saturated, np.maximum(values * scale, stored), stored)
-    return restored
+    return np.asarray(np.where(saturated, np.maximum(values * scale, stored), stored))

@@ -47,15 +47,10 @@ def check_white_level(value: float | None) -> None:
 
 @dataclass(frozen=True)
 class WhiteLevel:
-    """The stored value from which observations count as saturated.
+    """The stored value from which observations count as saturated."""
 
-    Args:
-        value: in the unit of the files, such as 4095.
-        origin: "given" by the user, stated in the "file", seen in the "images", or the "full scale" of the files.
-    """
-
-    value: float
-    origin: Origin
+    value: float  # in the unit of the files, such as 4095
+    origin: Origin  # given by the user, stated in the file, seen in the images, or the full scale of the files
 
 
 _NOTHING = np.empty(0, np.int64)
@@ -119,7 +114,6 @@ class Saturation:
 
     @cached_property
     def _decision(self) -> tuple[WhiteLevel | None, list[NDArray[np.integer]]]:
-        """The white level, and the saturated pixels of each image."""
         saturated = [image.saturated for image in self.images]
         if self.given is not None:
             return WhiteLevel(float(self.given), "given"), saturated
@@ -137,10 +131,7 @@ class Saturation:
         return WhiteLevel(float(full_scale), "full scale"), saturated
 
     def _stated_level(self, maximum: int) -> int | None:
-        """Return the level that all files state.
-
-        PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
-        """
+        # PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
         levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
@@ -182,11 +173,8 @@ def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, sta
     full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
     if given is not None:
         if full_scale is not None and given > full_scale:
-            raise InputError(
-                f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
-                path=path,
-                hint="Lower the white level, or leave it out",
-            )
+            problem = f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}"
+            raise InputError(problem, path=path, hint="Lower the white level, or leave it out")
         return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
     maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
     if not maximum:
