@@ -10,23 +10,19 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from scenes import directions_at
 from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.fits.two_halves import alternating_signs
 from splinecli.inference import estimate_normals
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
-from splinecli.methods import MethodOptions, make_estimator
-from splinecli.refinement.features import brightness, refine_features
+from splinecli.methods import make_estimator
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
-from splinecli.training.refinement import pixel_features
 
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)
@@ -179,22 +175,3 @@ def test_the_refinement_sees_what_is_left() -> None:
         estimate_normals(capture, make_estimator("spline-net"), stage=stage)
     assert np.abs(seen[0] - direct)[INSIDE].mean() < 0.5 * indirect.mean()
     assert stages == [["removing indirect light", len(BOWL)], ["refining", 0]]
-
-
-def test_training_sees_what_the_refinement_sees() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
-    seen = []
-
-    def refine(
-        _: NetworkRefiner, __: object, ___: object, light_of: LightOf, normals: Floats, errors: Floats, **____: object
-    ) -> None:
-        seen.extend(map(torch.from_numpy, (light_of(EVERYWHERE).observations, normals.copy(), errors.copy())))
-
-    with patch.object(NetworkRefiner, "refine", refine):
-        estimate_normals(Capture("bowl", direct + indirect, LIGHTS, tuple(range(10)), MASK), estimator)
-    observations, lights = torch.from_numpy(direct + indirect), torch.from_numpy(LIGHTS).float()
-    left, normals, errors = seen
-    expected = refine_features(left, lights, normals, errors, brightness(observations), alternating_signs(lights))
-    features = pixel_features(estimator.network, MASK, observations, lights)
-    torch.testing.assert_close(features, expected, atol=1e-3, rtol=0)

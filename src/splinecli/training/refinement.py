@@ -9,13 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.light.indirect_light import find_indirect_light
-from splinecli.light.lamp_light import LampLight
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
@@ -150,7 +147,7 @@ class ScenePool:
             maps, mask = add_background(maps, mask, lights, generator)
         radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
         observations, lights = photograph_scene(radiance, lights, self.config, generator)
-        features = pixel_features(self.network, mask.numpy(), observations, lights)
+        features = pixel_features(self.network, observations, lights)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
@@ -193,36 +190,20 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
 
 
 @torch.no_grad()
-def pixel_features(
-    network: SplineNet, mask: NDArray[np.bool_], observations: Tensor, light_directions: Tensor
-) -> Tensor:
-    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W), as inference does.
-
-    SPLINE-Net estimates the normals and their errors, then again where indirect light was removed.
-    """
+def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor) -> Tensor:
+    """Return the refinement net's features (P, CHANNELS) of a capture's pixels, after SPLINE-Net."""
     device = network.cells.device
     network.eval()
-    light_directions = light_directions.to(device)
-
-    def estimate(observations: Tensor) -> tuple[Tensor, Tensor]:
-        found = [network(batch.to(device), light_directions) for batch in torch.split(observations, _BATCH)]
-        normals, errors = map(torch.cat, zip(*found, strict=True))
-        return normals, errors
-
-    normals, errors = estimate(observations)
     reference = brightness(observations)
-    seen, directions, rows = observations.numpy(), light_directions.cpu().numpy(), np.arange(len(observations))
-    indirect = find_indirect_light(mask, seen, lambda rows: LampLight(seen[rows], directions), normals.cpu().numpy())
-    if indirect is not None:
-        changed = torch.from_numpy(indirect.counts_at(seen, rows))
-        observations = torch.from_numpy(indirect.remove(seen, rows))
-        if changed.any():
-            normals[changed], errors[changed] = estimate(observations[changed])
+    light_directions = light_directions.to(device)
     signs = alternating_signs(light_directions)
-    batches = zip(*(torch.split(values, _BATCH) for values in (observations.to(device), normals, errors)), strict=True)
-    return torch.cat(
-        [refine_features(batch, light_directions, found, error, reference, signs) for batch, found, error in batches]
-    )
+    found = []
+    for start in range(0, len(observations), _BATCH):
+        batch = observations[start : start + _BATCH].to(device)
+        normals, error = network(batch, light_directions)
+        assert error is not None, "TrainingConfig asks for an error head"
+        found.append(refine_features(batch, light_directions, normals, error, reference, signs))
+    return torch.cat(found)
 
 
 def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
