@@ -32,6 +32,12 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("splinecli.cli.console.LINE_SECONDS", math.inf)
 
 
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Save training runs without drawing the figures, which takes longer than the run itself."""
+    monkeypatch.setattr("splinecli.training.run_log.RunLog.draw", lambda self, maps: None)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real captures that lie beside the repository on the authors' machines; none of them is part of it."""

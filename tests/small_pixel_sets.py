@@ -11,6 +11,7 @@ from splinecli.pixel_sets.store import Pixels, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 
 MakeSet = Callable[..., PixelSet]
+THREE_SCENES = (("a", "one", 40, 30), ("b", "two", 30, 25), ("c", "three", 20, 12))
 
 
 def matte_pixels(pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = np.float32) -> Pixels:
@@ -27,11 +28,6 @@ def matte_pixels(pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = 
     mask = np.zeros((pixels, 2), bool)
     mask[:, 0] = True
     return Pixels((albedo * (normals @ directions.T).clip(0)).astype(dtype), normals, directions, mask)
-
-
-@pytest.fixture(name="matte_pixels")
-def _matte_pixels() -> Callable[..., Pixels]:
-    return matte_pixels
 
 
 @pytest.fixture

@@ -49,9 +49,8 @@ def numbers(line: str) -> list[float]:
 
 def test_training_speed(run: Run) -> None:
     """It crashed: CNN-PS has no LI-Net, so its updates cannot alternate."""
-    printed = run(
-        "training_speed", "--batch-size", "4", "--steps", "1", "--warm-up", "1", "--device", "cpu"
-    ).splitlines()
+    arguments = ("--batch-size", "4", "--steps", "1", "--warm-up", "1", "--device", "cpu")
+    printed = run("training_speed", *arguments).splitlines()
     rows = [line.split("  ")[0] for line in printed[1:]]
     assert rows == ["compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps"]
     assert all(min(numbers(line[25:])) > 0 for line in printed[1:])
@@ -87,9 +86,8 @@ def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_render_accuracy(run: Run) -> None:
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run(
-        "render_accuracy", "--size", "12", "--samples", "4", "--scenes", "1", "--directions", "4"
-    ).splitlines()
+    arguments = ("--size", "12", "--samples", "4", "--scenes", "1", "--directions", "4")
+    printed = run("render_accuracy", *arguments).splitlines()
     assert [line.split()[0] for line in printed[2:5]] == ["diffuse", "specular", "metallic"]
     assert printed[-1].count("%") == 3
 
@@ -155,9 +153,8 @@ def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
     untrained = tmp_path / "untrained.safetensors"
     save_weights(SplineNet(NetworkConfig()), untrained)
     weights = "--weights", "spline-net", "--weights", str(untrained)
-    printed = run(
-        "measured_spheres", str(materials), str(lights), *weights, "--draws", "1", "--pixels", "4"
-    ).splitlines()
+    arguments = (str(materials), str(lights), *weights, "--draws", "1", "--pixels", "4")
+    printed = run("measured_spheres", *arguments).splitlines()
     trained, fit = (float(re.findall(r": (\S+) degrees", line)[0]) for line in printed)
     assert trained < 0.7 * fit
 

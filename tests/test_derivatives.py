@@ -28,9 +28,8 @@ def sphere(sign: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_sphere(sign: int) -> None:
     normal_map, mask = sphere(sign)
     found = curvature_of_normals(normal_map, mask)
-    np.testing.assert_allclose(
-        found[mask], np.broadcast_to((sign / RADIUS, 1 / RADIUS**2), found[mask].shape), rtol=0.02
-    )
+    expected = np.tile((sign / RADIUS, 1 / RADIUS**2), (len(found[mask]), 1))
+    np.testing.assert_allclose(found[mask], expected, rtol=0.02)
     assert np.isnan(found[~mask]).all()
     slopes = gradient_of_normals(normal_map, mask)
     np.testing.assert_allclose(slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5)

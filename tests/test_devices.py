@@ -63,32 +63,36 @@ def enter(mount: Path, groups: str) -> None:
     write(mount.parent / "groups", groups)
 
 
-def test_quota_of_a_control_group(mount: Path) -> None:
-    write(mount / "cpu.max", "max 100000\n")
-    write(mount / "jobs/cpu.max", "300000 100000\n")
-    write(mount / "jobs/ours/cpu.max", "400000 100000\n")
+QUOTAS = {
+    "version 2": (
+        "0::/jobs/ours\n",
+        {"cpu.max": "max 1", "jobs/cpu.max": "3 1", "jobs/ours/cpu.max": "4 1"},
+        [3, 4],
+    ),
+    "the top": ("0::/\n", {"cpu.max": "max 100000\n", "jobs/cpu.max": "300000 100000\n"}, []),
+    "a container that shows the host's path": ("0::/docker/0123abcd\n", {"cpu.max": "150000 100000\n"}, [1.5]),
+    "version 1": (
+        "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n",
+        {
+            "cpu,cpuacct/cpu.cfs_quota_us": "-1\n",
+            "cpu,cpuacct/cpu.cfs_period_us": "100000\n",
+            "cpu,cpuacct/box/cpu.cfs_quota_us": "50000\n",
+            "cpu,cpuacct/box/cpu.cfs_period_us": "100000\n",
+        },
+        [0.5],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", QUOTAS)
+def test_quotas_of_control_groups(mount: Path, case: str) -> None:
+    """The groups above limit a process, too."""
+    groups, files, expected = QUOTAS[case]
+    for name, text in files.items():
+        write(mount / name, text)
     assert cgroup_quotas() == []
-    enter(mount, "0::/jobs/ours\n")
-    # The group above limits this one, too.
-    assert sorted(cgroup_quotas()) == [3, 4]
-    enter(mount, "0::/\n")
-    assert cgroup_quotas() == []
-
-
-def test_quota_inside_a_container_that_shows_the_host_s_path(mount: Path) -> None:
-    write(mount / "cpu.max", "150000 100000\n")
-    enter(mount, "0::/docker/0123abcd\n")
-    assert cgroup_quotas() == [1.5]
-
-
-def test_quota_of_version_1(mount: Path) -> None:
-    enter(mount, "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n")
-    write(mount / "cpu,cpuacct/cpu.cfs_quota_us", "-1\n")
-    write(mount / "cpu,cpuacct/cpu.cfs_period_us", "100000\n")
-    assert cgroup_quotas() == []
-    write(mount / "cpu,cpuacct/box/cpu.cfs_quota_us", "50000\n")
-    write(mount / "cpu,cpuacct/box/cpu.cfs_period_us", "100000\n")
-    assert cgroup_quotas() == [0.5]
+    enter(mount, groups)
+    assert sorted(cgroup_quotas()) == expected
 
 
 def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,9 +127,7 @@ def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: py
     ("machine", "affinity", "quotas", "expected"),
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
-def test_available_cores(
-    machine: int | None, affinity: int, quotas: list[float], expected: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_available_cores(machine, affinity, quotas, expected, monkeypatch):
     monkeypatch.setattr(devices.os, "cpu_count", lambda: machine)
     monkeypatch.setattr(devices.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
     monkeypatch.setattr(devices, "cgroup_quotas", lambda: quotas)
@@ -133,9 +135,7 @@ def test_available_cores(
 
 
 @pytest.mark.parametrize(("threads", "cores", "expected"), [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
-def test_threads_are_only_ever_lowered(
-    threads: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     now = [threads]
     monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
     monkeypatch.setattr(torch, "set_num_threads", lambda count: now.__setitem__(0, count))

@@ -15,9 +15,7 @@ from splinecli.system.extras import import_extra
         ("fast_simplification", "mesh", "fast-simplification"),
     ],
 )
-def test_the_message_names_the_packages_and_the_command(
-    module: str, extra: str, named: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_message_names_the_packages_and_the_command(module, extra, named, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UsageError, match=rf"{named}.*Run pip install 'splinecli\[{extra}\]'"):
         import_extra(module, extra)

@@ -1,6 +1,7 @@
 """Output files appear complete or not at all."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -28,23 +29,16 @@ def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: 
     path = tmp_path / "out.bin"
     write_bytes(path, b"old")
 
-    for failure, seen in ((OSError(28, "No space left on device"), OutputError), (KeyboardInterrupt(),) * 2):
-
-        def fail(*_: object, failure: BaseException = failure) -> None:
-            raise failure
-
-        monkeypatch.setattr(Path, "replace", fail)
-        with pytest.raises(seen if isinstance(seen, type) else type(seen)):
+    for failure, seen in ((OSError(28, "full"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)):
+        monkeypatch.setattr(Path, "replace", Mock(side_effect=failure))
+        with pytest.raises(seen):
             write_bytes(path, b"new")
         assert path.read_bytes() == b"old"
         assert names_in(tmp_path) == ["out.bin"]
 
 
 def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("splinecli.system.files.sync", fail)
+    monkeypatch.setattr("splinecli.system.files.sync", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(OutputError, match="No space left"):
         write_bytes(tmp_path / "a" / "b" / "out.bin", b"content")
     assert names_in(tmp_path) == []

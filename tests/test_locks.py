@@ -5,6 +5,7 @@ import os
 import sys
 import types
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -63,11 +64,7 @@ def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path: Path) -> No
 
 def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / LOCK).touch()
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
     message = r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise choose another -o"
     with pytest.raises(OutputError, match=message), locked(tmp_path):
         pytest.fail("it has no lock")

@@ -98,32 +98,28 @@ def test_lights_that_are_not_valid_leave_no_trace() -> None:
     assert torch.equal(map_scale(bright, valid.expand(3, 12)), map_scale(observations[:, valid]))
 
 
-@quick
-@given(SEEDS)
-def test_order_of_lights_does_not_matter(seed: int) -> None:
-    observations, directions = random_rig(seed, 3, 40)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(seed))
-    one, other = sparse_map(observations, directions), sparse_map(observations[:, order], directions[order])
-    torch.testing.assert_close(one.values, other.values)
-    assert torch.equal(one.occupied, other.occupied)
+ZERO, ONE = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+SYMMETRIES = {
+    "another order": (lambda lights: lights, lambda maps: maps),
+    # rot90 with k = 1 turns a picture counterclockwise, as the lights are.
+    "turned by 90 degrees": (
+        lambda light: rotate_about_view_axis(light, ZERO, ONE),
+        lambda maps: maps.rot90(1, (2, 3)),
+    ),
+    "mirrored in y": (lambda lights: lights * torch.tensor((1.0, -1.0, 1.0)), lambda maps: maps.flip(2)),
+}
 
 
+@pytest.mark.parametrize("name", SYMMETRIES)
 @quick
 @given(SEEDS)
-def test_lights_turned_by_90_degrees_turn_the_map(seed: int) -> None:
+def test_maps_follow_the_lights(name: str, seed: int) -> None:
+    change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
-    zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-    turned = sparse_map(observations, rotate_about_view_axis(directions, zero, one))
-    # rot90 with k = 1 turns a picture counterclockwise, as the lights were.
-    torch.testing.assert_close(turned.values, sparse_map(observations, directions).values.rot90(1, (2, 3)))
-
-
-@quick
-@given(SEEDS)
-def test_lights_mirrored_in_y_turn_the_rows_over(seed: int) -> None:
-    observations, directions = random_rig(seed, 3, 20)
-    mirrored = sparse_map(observations, directions * torch.tensor((1.0, -1.0, 1.0)))
-    torch.testing.assert_close(mirrored.values, sparse_map(observations, directions).values.flip(2))
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))
+    one, other = sparse_map(observations, directions), sparse_map(observations[:, order], change(directions)[order])
+    torch.testing.assert_close(other.values, changed(one.values))
+    assert torch.equal(other.occupied, changed(one.occupied))
 
 
 def test_lights_of_each_pixel_s_own_are_like_shared_ones() -> None:

@@ -53,9 +53,5 @@ def test_inverse_of_a_singular_matrix_is_positive(rank: int, dtype: type) -> Non
 def test_product_with_a_vector() -> None:
     matrices, vectors = positive_matrices(50), np.random.default_rng(1).normal(size=(50, 3))
     entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    np.testing.assert_allclose(
-        np.stack(multiply_symmetric(entries, vectors.T), axis=1),
-        np.einsum("pij,pj->pi", matrices, vectors),
-        rtol=1e-12,
-        atol=1e-12,
-    )
+    found, expected = multiply_symmetric(entries, vectors.T), np.einsum("pij,pj->ip", matrices, vectors)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)

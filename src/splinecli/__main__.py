@@ -4,7 +4,7 @@ import os
 import sys
 import warnings
 
-from splinecli.cli.signals import INTERRUPTED, end_on_signals, ignore_signals, report_interruption
+from splinecli.cli.signals import DEFERRED, INTERRUPTED, end_on_signals, ignore_signals, report_interruption
 
 
 def run() -> None:
@@ -18,8 +18,11 @@ def run() -> None:
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
         from splinecli.cli.main import main
 
+        if DEFERRED.is_set():
+            raise KeyboardInterrupt
         code = main()
     except KeyboardInterrupt:  # outside of the command
+        ignore_signals()
         code = report_interruption()
     ignore_signals()
     if code == INTERRUPTED or "TORCHELASTIC_RUN_ID" in os.environ:

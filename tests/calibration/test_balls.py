@@ -1,6 +1,5 @@
 """From folders of photographs to the lights."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.conftest import Render
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.capture import read_light_directions
@@ -16,7 +16,6 @@ from splinecli.maths.normals import angle_between_deg
 from splinecli.pictures.calibration import calibration_picture
 
 BALL = Circle(103.3, 88.7, 61.4)
-Render = Callable[..., NDArray[np.float32]]
 
 
 def write(folder: Path, name: str, picture: NDArray[np.floating]) -> Path:
@@ -55,9 +54,7 @@ def test_lights_of_a_ball(ball: Path, render_ball: Render, lights: NDArray[np.fl
     assert (green > red + 50).sum() > 200
 
 
-def test_several_balls_are_averaged(
-    ball: Path, tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]
-) -> None:
+def test_several_balls_are_averaged(ball, tmp_path, render_ball, lights):
     second = Circle(80.2, 70.9, 50.0)
     for number, light in enumerate(lights, start=1):
         picture = render_ball(light, second.x, second.y, second.radius, lamp=0.9)
@@ -75,10 +72,9 @@ def test_several_balls_are_averaged(
 
 def test_pictures_of_another_size(ball: Path) -> None:
     write(ball, "3.png", np.zeros((50, 60)))
-    with pytest.raises(InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):
-        calibrate_ball(find_ball_files(ball), circle=BALL)
-    with pytest.raises(InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):
-        calibrate_ball(find_ball_files(ball))
+    for circle in (BALL, None):
+        with pytest.raises(InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):
+            calibrate_ball(find_ball_files(ball), circle=circle)
 
 
 def test_real_balls(shared_data: Path) -> None:

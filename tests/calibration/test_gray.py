@@ -45,10 +45,10 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
     if (target, brightest) == ("card", 3.0):
         with pytest.raises(InputError, match=r"3\.png: the target is dark or overexposed"):
             measure_light_intensities(find_ball_files(folder), lights, target)
-    else:
-        found = measure_light_intensities(find_ball_files(folder), lights, target)
-        # Only the rim of the ball is left under the brightest lamp, where half a pixel counts most.
-        np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
+        return
+    found = measure_light_intensities(find_ball_files(folder), lights, target)
+    # Only the rim of the ball is left under the brightest lamp, where half a pixel counts most.
+    np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
 def test_a_ball_without_a_mask_is_refused(tmp_path: Path) -> None:
@@ -67,10 +67,6 @@ def test_images_and_masks_of_another_size(tmp_path: Path) -> None:
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
 
 
-def card_images() -> NDArray[np.float64]:
-    return np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
-
-
 @pytest.mark.parametrize("exposure", [1.0, 1.7], ids=["whole", "partly saturated"])
 def test_a_ball(tmp_path: Path, exposure: float) -> None:
     images = (ball_images() * exposure).clip(0, 1)
@@ -82,7 +78,8 @@ def test_a_ball(tmp_path: Path, exposure: float) -> None:
 
 @pytest.mark.parametrize(("gamma", "ambient"), [(1.0, 0.0), (2.2, 0.0), (1.0, 0.1)])
 def test_a_card(tmp_path: Path, gamma: float, ambient: float) -> None:
-    folder = write(tmp_path / "card", (card_images() + ambient) ** (1 / gamma), None)
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
+    folder = write(tmp_path / "card", (images + ambient) ** (1 / gamma), None)
     if ambient:
         stored = np.full((20, 30, 3), round(ambient * 65535), np.uint16)
         cv2.imwrite(str(folder / "ambient.png"), stored)

@@ -1,6 +1,5 @@
 """Positions of lamps from mirror balls: the oracle is the law of reflection under a lamp of known position."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.conftest import Render
 from scenes import directions_at, spiral_lights
 from splinecli.calibration.balls import BallCalibration, BallFiles, calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
@@ -17,7 +17,6 @@ from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.calibration.view import DISTANT, SHORTEST_LENS, View
 from splinecli.maths.normals import unit
 
-Render = Callable[..., NDArray[np.float32]]
 SHAPE = 160, 400
 BALLS = Circle(70, 90, 60), Circle(320, 75, 60)
 
@@ -39,9 +38,8 @@ def calibrate(
         for number, lamp in enumerate(positions):
             picture = render_ball(lamp, circle.x, circle.y, circle.radius, SHAPE, near=True)
             cv2.imwrite(str(folder / name / f"{number}.png"), np.rint(picture.clip(0, 1) * 255).astype(np.uint8))
-        balls.append(
-            calibrate_ball(find_ball_files(folder / name), circle=circle, camera_matrix=matrix if known else None)
-        )
+        files = find_ball_files(folder / name)
+        balls.append(calibrate_ball(files, circle=circle, camera_matrix=matrix if known else None))
     return balls
 
 
@@ -82,9 +80,8 @@ def photographed(
     towards = directions_at(azimuth, zenith)
     places = towards * rng.uniform(300, 700, (6, 1)) * min(1, eye[2] / 900)
     assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(source, focal)
-    view = View(
-        np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1))), source, SHORTEST_LENS * PIXELS[1]
-    )
+    matrix = np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1)))
+    view = View(matrix, source, SHORTEST_LENS * PIXELS[1])
     balls = []
     for side in (-1, 1):
         centre = np.array((120.0 * side, rng.uniform(-30, 30), height * side))

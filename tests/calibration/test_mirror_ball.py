@@ -1,11 +1,10 @@
 """Highlights and directions, against a ball whose reflections are followed to the lamp."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.conftest import Render
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.mirror_ball import ball_centre, check_in_front, find_highlight, reflect
 from splinecli.errors import InputError
@@ -13,7 +12,6 @@ from splinecli.maths.normals import angle_between_deg
 
 BALL = Circle(103.3, 88.7, 61.4)
 DISTANT = np.array(((1e6, 0, 104.5), (0, 1e6, 89.5), (0, 0, 1)))
-Render = Callable[..., NDArray[np.float32]]
 
 
 def direction_at(ball: Circle, x: float, y: float) -> NDArray[np.float64]:
@@ -41,10 +39,9 @@ def test_a_sparkle_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) 
 
 def test_no_highlight(render_ball: Render) -> None:
     behind = np.array([0.0, 0.6, -0.8])
-    with pytest.raises(InputError, match="found no highlight"):
-        find_highlight(render_ball(behind, lamp=0.03), BALL)
-    with pytest.raises(InputError, match="found no highlight"):
-        find_highlight(np.zeros((180, 210), np.float32), BALL)
+    for picture in (render_ball(behind, lamp=0.03), np.zeros((180, 210), np.float32)):
+        with pytest.raises(InputError, match="found no highlight"):
+            find_highlight(picture, BALL)
 
 
 def test_a_window_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) -> None:

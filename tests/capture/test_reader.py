@@ -1,6 +1,6 @@
 """Whole captures: observations against the photographs written, and real ones against known errors."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +8,11 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from capture.conftest import WriteImage
 from scenes import ring_lights, write_capture
 from splinecli.capture import CaptureWarning, open_capture, read_capture
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
-
-WriteImage = Callable[..., Path]
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 INTENSITIES = np.array([[1, 2, 4], [2, 2, 2], [0.5, 1, 3], [1, 1, 1]])
@@ -46,9 +45,7 @@ def test_without_intensities_and_mask(capture_folder: Path, photographs: NDArray
     np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6)
     assert capture.observations.dtype == np.float32
     assert (capture.name, capture.light_indices, capture.ground_truth) == ("vase", (0, 1, 2, 3), None)
-    assert capture.warnings == ()
-    assert capture.mask.shape == (5, 6)
-    assert capture.mask.all()
+    assert (capture.warnings, capture.mask.shape, capture.mask.all()) == ((), (5, 6), True)
     np.testing.assert_allclose(capture.light_directions, LIGHTS)
 
 
@@ -83,19 +80,15 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
         source.read()
 
 
-def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
-    capture_folder: Path, write_image: WriteImage
-) -> None:
+def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(capture_folder, write_image):
     for number in range(8, 12):
         (capture_folder / f"img{number}.png").unlink()
         tifffile.imwrite(capture_folder / f"{number}.tif", np.array([[0, np.nan, 2.5]], np.float32))
     write_image("vase/mask.png", np.array([[1, 0, 1]], np.uint8))
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
-    assert texts(capture.warnings) == (
-        "50.0 % of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a mask or"
-        " with --auto-mask.",
-    )
+    (warning,) = texts(capture.warnings)
+    assert warning.startswith("50.0 % of the pixels are black") and "Leave them out with a mask or" in warning
     (capture_folder / "mask.png").unlink()
     with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
         read_capture(capture_folder)
@@ -113,19 +106,15 @@ def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
 
 
 @pytest.mark.parametrize(("n_black", "share"), [(1, None), (2, "2.0"), (100, "100.0")])
-def test_pixels_that_no_light_reaches(
-    capture_folder: Path, write_image: WriteImage, n_black: int, share: str | None
-) -> None:
+def test_pixels_that_no_light_reaches(capture_folder, write_image, n_black, share):
     for number in range(8, 12):
         pixels = np.full((10, 10), 1, np.uint16)
         pixels.flat[:n_black] = 0
         pixels[9, 9] = number == 8 and n_black < 100  # lit once: not black
         write_image(f"vase/img{number}.png", pixels)
-    message = (
-        f"{share} % of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a"
-        " mask or with --auto-mask."
-    )
-    assert texts(read_capture(capture_folder).warnings) == (() if share is None else (message,))
+    found = texts(read_capture(capture_folder).warnings)
+    assert len(found) == (share is not None)
+    assert all(text.startswith(f"{share} % of the pixels are black under every light") for text in found)
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,8 @@ MASK = np.array([[True, False, True], [True, True, False]])
 
 
 def make(**changes: Any) -> Capture:
-    fields: dict[str, Any] = {
-        "name": "vase",
-        "observations": np.arange(16).reshape(4, 4),
-        "light_directions": LIGHTS,
-        "light_indices": (0, 1, 2, 7),
-        "mask": MASK,
-    }
-    return Capture(**(fields | changes))
+    fields: dict[str, Any] = {"name": "vase", "observations": np.arange(16).reshape(4, 4), "mask": MASK}
+    return Capture(**(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes))
 
 
 @pytest.mark.parametrize(

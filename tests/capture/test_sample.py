@@ -37,10 +37,7 @@ def test_a_dark_background_is_left_out():
 @pytest.mark.parametrize("masked", [True, False])
 def test_wrong_lights_are_named_without_a_mask(masked):
     images, lights, mask = ball_before(0.01)
-    capture = capture_from_arrays(images, lights * (-1, 1, 1), mask if masked else np.ones_like(mask))
-    codes = [warning.code for warning in check_arrays(capture, intensities_measured=True)]
-    assert codes == (["light_frame"] if masked else ["light_frame", "no_mask"])
-    images, lights, mask = ball_before(0.01)
-    capture = capture_from_arrays(images, lights, mask if masked else np.ones_like(mask))
-    codes = [warning.code for warning in check_arrays(capture, intensities_measured=True)]
-    assert codes == ([] if masked else ["no_mask"])
+    for signs, expected in (((-1, 1, 1), ["light_frame"]), ((1, 1, 1), [])):
+        capture = capture_from_arrays(images, lights * signs, mask if masked else np.ones_like(mask))
+        codes = [warning.code for warning in check_arrays(capture, intensities_measured=True)]
+        assert codes == expected + ([] if masked else ["no_mask"])

@@ -1,17 +1,15 @@
 """Stamps change with every file of a capture, and only then."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from capture.conftest import WriteImage
 from scenes import write_capture
 from splinecli.capture import RadiometricCalibration, open_capture
 from splinecli.capture.stamp import digest
-
-WriteImage = Callable[..., Path]
 
 OTHERS = ("light_directions.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png")
 
@@ -50,10 +48,8 @@ def test_other_files_are_stamped_by_their_content(folder: Path, name: str, write
     assert stamp(folder) == before
     if name.endswith(".png"):
         write_image(f"vase/{name}", np.full((4, 5), 7, np.uint16))
-    elif name.endswith(".txt"):
-        (folder / name).write_bytes(content + b"# a comment\n")
     else:
-        (folder / name).write_bytes(content + b" ")
+        (folder / name).write_bytes(content + (b"# a comment\n" if name.endswith(".txt") else b" "))
     assert stamp(folder) != before
 
 

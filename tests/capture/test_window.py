@@ -46,11 +46,8 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
     cv2.imwrite(str(flats / "flat.png"), 255 - pattern)
     maps = []
     for crop, scale in ((None, None), WINDOWS[2]):
-        options = InferOptions(
-            method="ls", crop=crop, scale=scale, flat_field=str(flats), output=str(tmp_path / f"{scale}")
-        )
-        source = options.open(folder)
-        capture = source.read(as_stored=True)
+        options = InferOptions(method="ls", crop=crop, scale=scale, flat_field=str(flats))
+        capture = options.open(folder).read(as_stored=True)
         image = np.zeros((*capture.mask.shape, capture.n_lights), np.float32)
         image[capture.mask] = capture.observations
         maps.append(image)
@@ -64,9 +61,8 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
 def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str | None, tmp_path: Path) -> None:
     maps = {}
     for name, options in (("whole", (None, None)), ("part", (crop, scale))):
-        record = InferOptions(
-            method="ls", maps=("albedo",), crop=options[0], scale=options[1], output=str(tmp_path / name)
-        )
+        crop_and_scale = dict(zip(("crop", "scale"), options, strict=True))
+        record = InferOptions(method="ls", maps=("albedo",), output=str(tmp_path / name), **crop_and_scale)
         report = infer_capture(MEDALLION, record)
         assert (report["options"]["crop"], report["options"]["scale"]) == options
         folder = tmp_path / name / "medallion"
@@ -109,20 +105,13 @@ def test_windows_that_do_not_fit_are_refused() -> None:
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
 @pytest.mark.parametrize("perspective", [False, True])
-def test_near_lamps_light_a_part_as_they_light_the_whole(
-    crop: str | None, scale: str | None, perspective: bool, tmp_path: Path
-) -> None:
+def test_near_lamps_light_a_part_as_they_light_the_whole(crop, scale, perspective, tmp_path):
     matrix = tmp_path / "camera.txt"
     matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
     lights = []
     for options in ((None, None), (crop, scale)):
-        record = InferOptions(
-            crop=options[0],
-            scale=options[1],
-            light_distance=40.0,
-            pixel_size=0.1,
-            camera_matrix=str(matrix) if perspective else None,
-        )
+        camera = {"light_distance": 40.0, "pixel_size": 0.1, "camera_matrix": str(matrix) if perspective else None}
+        record = InferOptions(crop=options[0], scale=options[1], **camera)
         capture = record.open(MEDALLION).read(as_stored=True)
         places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
         points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
@@ -142,14 +131,6 @@ def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
     narrow = InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
     wide = InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION).read()
     assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
-
-
-def test_a_mask_of_the_part_goes_back_into_the_whole() -> None:
-    window = Window((2, 1, 5, 4), 2, (7, 9))
-    mask = np.ones((2, 3), np.bool_)
-    whole = window.whole(mask)
-    assert whole.shape == (7, 9)
-    assert [tuple(place) for place in np.argwhere(whole)] == [(1, 2), (1, 4), (1, 6), (3, 2), (3, 4), (3, 6)]
 
 
 def test_the_camera_of_the_part_sees_the_same_rays() -> None:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from cli.conftest import write_capture
+
 Spoil = Callable[[Path], list[object] | None]
 
 
@@ -60,6 +62,12 @@ def remove_images(capture: Path) -> None:
         path.unlink()
 
 
+def keep_two_images(capture: Path) -> None:
+    for index in range(3, 9):
+        (capture / f"image{index}.png").unlink()
+    lights(lambda lines: lines[:2])(capture)
+
+
 CASES: list[tuple[str, int, Spoil]] = [
     ("corrupt image", 3, write("image2.png", b"\x89PNG\r\n\x1a\nrubbish")),
     ("truncated image", 3, truncate),
@@ -90,6 +98,8 @@ CASES: list[tuple[str, int, Spoil]] = [
     ("foreign weights", 4, foreign_weights),
     ("pickled weights", 4, pickled_weights),
     ("missing light file", 3, option("--lights", "none.txt")),
+    ("two images", 3, keep_two_images),
+    ("same names", 2, lambda _: [write_capture(Path("others/sphere"))]),
 ]
 
 
@@ -102,19 +112,3 @@ def test_bad_input(name, code, spoil, capture, run, golden):
     assert result.err.count("\n") == 1
     golden(f"bad_input/{name.replace(' ', '_')}.txt", result.err)
     assert not Path("out").exists()
-
-
-def test_capture_with_two_images(capture, run, golden):
-    for index in range(3, 9):
-        (capture / f"image{index}.png").unlink()
-    lights(lambda lines: lines[:2])(capture)
-    result = run("infer", capture, "--method", "ls")
-    assert result.code == 3
-    golden("bad_input/two_images.txt", result.err)
-
-
-def test_same_names(capture, make_capture, run, golden):
-    make_capture("others/sphere")
-    result = run("infer", capture, "others/sphere")
-    assert result.code == 2
-    golden("bad_input/same_names.txt", result.err)

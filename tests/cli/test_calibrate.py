@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import write_capture
+from scenes import halfway, write_capture
 from splinecli.capture import read_light_directions
 
 SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
@@ -25,9 +25,7 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and light."""
     folder.mkdir()
     n, inside = normals()
-    for number, light in enumerate(lights):
-        half = light + np.array((0, 0, 1))
-        half /= np.linalg.norm(half)
+    for number, half in enumerate(halfway(lights)):
         spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
         picture = np.where(inside, 0.02 + 0.9 * spot, wall)
         cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
@@ -93,21 +91,15 @@ def test_positions_need_the_camera(run):
         assert Path("calibration", name).exists() == known
     Path("matrix.txt").write_text("900 0\n0 900\n")
     result = run(*arguments)
-    assert result.code == 3
-    assert "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.out
+    assert result.code == 3 and "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.out
 
 
 def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
-    half = LIGHTS + np.array((0, 0, 1))
-    np.savetxt("mistake.txt", half / np.linalg.norm(half, axis=1, keepdims=True))
+    np.savetxt("mistake.txt", halfway(LIGHTS))
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
-    assert result.code == 0
-    assert "the compared file differs by 13." in result.err
-    assert (
-        "warning: The compared file contains the normals of the ball at the highlights instead of the light"
-        in result.err
-    )
+    assert result.code == 0 and "the compared file differs by 13." in result.err
+    assert "warning: The compared file contains the normals of the ball at the highlights" in result.err
 
 
 def test_an_uncertain_outline(run):
@@ -116,8 +108,7 @@ def test_an_uncertain_outline(run):
     mask[:48] = 0
     cv2.imwrite("half.png", mask)
     result = run("calibrate", "one", "--mask", "half.png", "-o", "half")
-    assert result.code == 0
-    assert "warning: one: the outline of the ball is uncertain (" in result.err
+    assert result.code == 0 and "warning: one: the outline of the ball is uncertain (" in result.err
 
 
 def test_refusals(refuse):
@@ -178,9 +169,9 @@ def test_a_display_encoded_target_is_reported(run):
     arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
     assert "Add --transfer srgb if they are sRGB" in run(*arguments, "--transfer", "linear").err
     intensities = []
-    for curve in ("linear", "srgb", "auto"):
+    for curve in ("srgb", "auto"):
         run(*arguments, "--transfer", curve)
         intensities.append(Path("calibration/light_intensities.txt").read_text())
-    assert intensities[2] == intensities[1]
+    assert intensities[0] == intensities[1]
     assert "are read as sRGB. Add --transfer linear" in run(*arguments).err
     assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err

@@ -10,8 +10,7 @@ import pytest
 
 import splinecli
 from splinecli.diagnosis import checks
-
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+from test_notebook import read_medallion
 
 
 def move(path: Path, right: int, down: int) -> None:
@@ -58,8 +57,7 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     normals = picture / np.iinfo(picture.dtype).max * 2 - 1
     np.save(medallion / "normals_gt.npy", normals * signs)
     result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0
-    assert f"degrees with {negated} negated: it is probably in this frame" in result.err
+    assert result.code == 0 and f"degrees with {negated} negated: it is probably in this frame" in result.err
     assert codes() == [code]
     assert f"with {negated} negated" in refused(run, "--method", "ls")
     evaluation = run("evaluate", medallion, "--method", "ls", "--n-lights", 8, "--trials", 1)
@@ -95,12 +93,9 @@ def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
 
 
 def test_python_gives_the_same_warnings(medallion):
-    paths = sorted(medallion.glob("[01]*.png"))
-    move(paths[3], 2, -1)
-    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] for path in paths]
-    lights = np.loadtxt(medallion / "light_directions.txt") * (1, -1, 1)
-    intensities = np.loadtxt(medallion / "light_intensities.txt")
-    mask = cv2.imread(str(medallion / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    move(medallion / "04.png", 2, -1)
+    images, lights, intensities, mask = read_medallion(medallion)
+    lights *= (1, -1, 1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         estimate = splinecli.estimate_normals(images, lights, mask, light_intensities=intensities, method="ls")

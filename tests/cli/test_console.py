@@ -1,5 +1,6 @@
 """Progress and messages of the commands: a bar on a terminal, a line every half minute elsewhere."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -45,19 +46,13 @@ with Messages(quiet=False).progress("cat", 25) as advance:
         advance(1)
 """
     ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stderr=theirs, env={**os.environ, "TERM": "xterm", "COLUMNS": "80"}
-    )
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80"}
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=theirs, env=environment)
     os.close(theirs)
     shown = b""
-    while True:
-        try:
-            block = os.read(ours, 65536)
-        except OSError:  # the terminal was closed
-            break
-        if not block:
-            break
-        shown += block
+    with contextlib.suppress(OSError):  # when the terminal is closed
+        while block := os.read(ours, 65536):
+            shown += block
     assert process.wait() == 0
     percentages = {part.split()[-1] for part in shown.decode().split("%")[:-1] if part.split()}
     assert len(percentages) >= 4

@@ -51,8 +51,7 @@ def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
     with tifffile.TiffFile(out / "normals.tiff") as file:
         assert file.pages[0].description == "normals: x right, y up, z to the camera; green is y up"
     _, channels = read(out / "albedo.exr")
-    albedo = np.load(out / "albedo.npy")
-    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=2), albedo, rtol=1e-3)
+    np.testing.assert_allclose(np.stack([channels[n] for n in "RGB"], axis=2), np.load(out / "albedo.npy"), rtol=1e-3)
     assert channels["R"].dtype == np.float16
     header, channels = read(out / "depth.exr")
     depth = np.load(out / "depth.npy")
@@ -62,11 +61,8 @@ def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
 
 
 @pytest.mark.parametrize("command", [("infer", "sphere", "--method", "ls"), ("integrate", "missing.npy")])
-def test_without_the_library_nothing_is_done(
-    capture: Path, run: Any, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
-) -> None:
+def test_without_the_library_nothing_is_done(capture, run, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     result = run(*command, "--format", "exr")
-    assert result.code == 2
-    assert "EXR files need the package OpenEXR, which is not installed" in result.err
+    assert result.code == 2 and "EXR files need the package OpenEXR, which is not installed" in result.err
     assert not Path("out/sphere").exists()

@@ -67,9 +67,8 @@ def test_help_and_ls_do_not_import_torch(capture):
         "    print(code, *sorted({'torch', 'cv2', 'rich'} & set(sys.modules)), file=sys.stderr)"
     )
     commands = ["--help", "infer --help", "--version", f"infer {capture} --method ls"]
-    done = subprocess.run(
-        [sys.executable, "-c", script, *commands], capture_output=True, text=True, check=True, cwd=capture.parent
-    )
+    call = [sys.executable, "-c", script, *commands]
+    done = subprocess.run(call, capture_output=True, text=True, check=True, cwd=capture.parent)
     *helps, ended = done.stderr.splitlines()
     assert helps == ["0", "0", "0"]
     assert ended.split()[0] == "0"

@@ -7,12 +7,14 @@ import sys
 import time
 import tomllib
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 
-from splinecli.cli.signals import GRACE_SECONDS
+from splinecli.cli import main
+from splinecli.cli.signals import GRACE_SECONDS, report_interruption
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
@@ -29,12 +31,13 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
             result = run("infer", capture, "--method", "ls", option, path)
             assert (result.code, result.err) == (3, f"splinecli: {path}: found {kind}, expected {expected}.\n")
     run("infer", capture, "--method", "ls")
-    result = run("integrate", "out/sphere", "--camera-matrix", "/dev/zero")
-    assert (result.code, result.err) == (3, "splinecli: /dev/zero: found a device, expected a text file.\n")
-    result = run("train", "-o", "run", "--config", "/dev/zero")
-    assert (result.code, result.err) == (4, "splinecli: /dev/zero: found a device, expected a text file.\n")
-    result = run("integrate", "/dev/zero", "-o", "surface")
-    assert (result.code, result.err) == (3, "splinecli: /dev/zero: found a device, expected a normal map.\n")
+    for command, code, expected in (
+        ("integrate out/sphere --camera-matrix /dev/zero", 3, "a text file"),
+        ("train -o run --config /dev/zero", 4, "a text file"),
+        ("integrate /dev/zero -o surface", 3, "a normal map"),
+    ):
+        result = run(*command.split())
+        assert (result.code, result.err) == (code, f"splinecli: /dev/zero: found a device, expected {expected}.\n")
 
 
 @posix
@@ -95,18 +98,17 @@ def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path
     forged = "a\nsplinecli: warning: fake"
     for name in (forged, "\x1b[2J\u202eb"):
         make_capture("plain").rename(tmp_path / name)
-        results = [
-            run("infer", name, "--method", "ls"),
-            run("infer", name, "--method", "ls"),
-            run("infer", name, "none", "--method", "ls", "--overwrite"),
-            run("info", name),
-            run("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"),
-            run("infer", name, "--method", "ls", "--lights", f"{name}/none\n"),
-        ]
-        for result in results:
-            for text in (result.out, result.err):
-                assert "\nsplinecli: warning: fake" not in text
-                assert not set("\x1b\u202e") & set(text)
+        for command in (
+            ("infer", name, "--method", "ls"),
+            ("infer", name, "--method", "ls"),
+            ("infer", name, "none", "--method", "ls", "--overwrite"),
+            ("info", name),
+            ("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"),
+            ("infer", name, "--method", "ls", "--lights", f"{name}/none\n"),
+        ):
+            result = run(*command)
+            text = result.out + result.err
+            assert "\nsplinecli: warning: fake" not in text and not set("\x1b\u202e") & set(text)
     make_capture("plain").rename(tmp_path / "a\nb")
     assert run("infer", "a\nb", "--method", "ls").out.startswith("out/a\\nb: 448 pixels")
 
@@ -127,8 +129,7 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
     message = 'splinecli: sphere/filenames.txt:1: the image "../elsewhere/image1.png" is outside of this folder.'
     for command in (["infer", "--method", "ls"], ["info"], ["evaluate", "--method", "ls", "--n-lights", 4]):
         result = run(command[0], capture, *command[1:])
-        assert result.code == 3
-        assert message in result.err
+        assert result.code == 3 and message in result.err
         assert "set a link to it there" in result.err
     (capture / "filenames.txt").write_text("\n".join(str((elsewhere / n).absolute()) for n in names))
     assert "is outside of this folder" in run("info", capture).err
@@ -156,15 +157,14 @@ def test_a_low_limit_on_memory_is_one_line(capture):
 
 def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatch):
     make_capture("second")
-    real = cv2.imdecode
+    real, failed = cv2.imdecode, []
 
     def fail(*args: object) -> object:
-        if not failed:
-            failed.append(True)
-            raise MemoryError
-        return real(*args)
+        if failed:
+            return real(*args)
+        failed.append(True)
+        raise MemoryError
 
-    failed: list[bool] = []
     monkeypatch.setattr(cv2, "imdecode", fail)
     result = run("infer", capture, "second", "--method", "ls", "-q")
     message = "splinecli: sphere: there is not enough memory. Close other programs, or use smaller images.\n"
@@ -173,10 +173,7 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
 
 
 def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
-    def fail(*_: object, **__: object) -> None:
-        raise EOFError
-
-    monkeypatch.setattr("splinecli.pipeline.info.describe_capture", fail)
+    monkeypatch.setattr("splinecli.pipeline.info.describe_capture", Mock(side_effect=EOFError))
     assert run("info", capture).code == 1
 
 
@@ -203,9 +200,8 @@ def start(code: str) -> subprocess.Popen[str]:
     """Start a process that runs the code as the command line would, and wait until it says so."""
     script = "import importlib, time\nm = importlib.import_module('splinecli.cli.main')"
     script += f"\ndef work(*_):\n    {code}\nm.main = work\nfrom splinecli.__main__ import run\nrun()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([sys.executable, "-c", script], text=True, **pipes)
     assert process.stdout.readline() == "ready\n"
     return process
 
@@ -245,9 +241,7 @@ def test_the_dependencies_have_no_known_holes():
     """Floors above the versions with published holes in what is used here."""
     text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
     listed = tomllib.loads(text)["project"]["dependencies"]
-    floors = {
-        name: tuple(int(part) for part in floor.split(".")) for name, floor in (item.split(">=") for item in listed)
-    }
+    floors = {name: tuple(map(int, floor.split("."))) for name, floor in (item.split(">=") for item in listed)}
     for name, floor in {
         "torch": (2, 6),  # CVE-2025-32434: code runs from a file read with weights_only
         "pillow": (12, 3),  # writes beyond buffers, and bombs, in many formats
@@ -256,3 +250,61 @@ def test_the_dependencies_have_no_known_holes():
         "safetensors": (0, 5),
     }.items():
         assert floors[name] >= floor, name
+
+
+LIBRARY = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.{signal})
+    for _ in range(100_000):
+        pass
+except BaseException:
+    print("swallowed")
+"""
+IMPORTING = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+from splinecli import __main__
+from splinecli.cli import main
+def work():
+    import library
+    print("imported", flush=True)
+    for _ in range(200):
+        time.sleep(0.1)
+main.main = work
+__main__.run()
+"""
+
+
+@posix
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path, name: str) -> None:
+    (tmp_path / "library.py").write_text(LIBRARY.format(signal=name))
+    done = subprocess.run([sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "imported\n", "splinecli: interrupted.\n")
+
+
+def test_libraries_print_nothing(tmp_path: Path) -> None:
+    command = """
+import logging, sys, warnings
+from splinecli import __main__
+from splinecli.cli import main
+@main.app.command()
+def noisy():
+    logging.getLogger("library").error("a log")
+    warnings.warn("a warning", RuntimeWarning)
+sys.argv = ["splinecli", "noisy"]
+__main__.run()
+"""
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_an_interruption_is_told_once(capfd, monkeypatch):
+    """The thread that ends the process after a SIGTERM may come when the command has told of it."""
+    monkeypatch.setattr(main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130}))
+    try:
+        assert main.main([]) == report_interruption() == 130
+    finally:
+        main.TOLD.clear()
+    assert capfd.readouterr().err == "splinecli: interrupted.\n"

@@ -6,6 +6,7 @@ import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -45,11 +46,7 @@ PLANTS: dict[str, Callable[[Path, Path], object]] = LINKS | {
 @pytest.fixture(autouse=True)
 def alarm():
     """End what hangs."""
-
-    def hang(*_: object) -> None:
-        raise TimeoutError
-
-    before = signal.signal(signal.SIGALRM, hang)
+    before = signal.signal(signal.SIGALRM, Mock(side_effect=TimeoutError))
     signal.alarm(300)
     yield
     signal.alarm(0)

@@ -54,15 +54,10 @@ def test_warnings(run, capture):
     cv2.imwrite(str(photographs[1]), np.full_like(stored, 65_535))
     cv2.imwrite(str(photographs[2]), stored // 30)
     warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
-    assert warnings[:3] == [
-        "The images have 8 bits; 16-bit linear images give better normals.",
-        "Images saturated in more than 1 % of the pixels: 1, most of all image2.png (100.0 %);"
-        " a shorter exposure gives better normals.",
-        "Images that use less than 5 % of the range: 1, such as image3.png; a longer exposure gives less noise.",
-    ]
+    words = ("8 bits", "image2.png (100.0 %)", "5 % of the range: 1, such as image3.png")
+    assert all(word in warning for word, warning in zip(words, warnings[:3], strict=True))
     cv2.imwrite(str(photographs[3]), stored[:20])
-    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
-    assert "The images have 2 different sizes; all images need the same size." in warnings
+    assert "The images have 2 different sizes" in run("info", str(capture), "--json").out
 
 
 def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
@@ -77,16 +72,11 @@ def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     assert run("info", capture, "--plot", tmp_path / "mine.png", "--overwrite").code == 0
 
 
-def clip_at_12_bits(capture: Path, times: float = 1.2) -> None:
-    """Turn the images into 12-bit data in 16-bit files, `times` overexposed."""
-    for path in capture.glob("image*.png"):
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
-        cv2.imwrite(str(path), np.minimum(stored * times / 16, 4095).astype(np.uint16))
-
-
 def test_the_white_level_of_12_bit_data(run, capture):
     """Clipped at 4095, no value reaches the full scale of the files, and yet many are saturated."""
-    clip_at_12_bits(capture)
+    for path in capture.glob("image*.png"):
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
+        cv2.imwrite(str(path), np.minimum(stored * 1.2 / 16, 4095).astype(np.uint16))
     result = run("info", capture)
     assert "white level  4095, found in the images\n" in result.out
     report = json.loads(run("info", capture, "--json").out)

@@ -37,14 +37,18 @@ def here(tmp_path, monkeypatch):
     cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 
 
+def check_heights(depth: np.ndarray) -> None:
+    _, heights, inside = sphere()
+    assert np.array_equal(np.isfinite(depth), inside)
+    assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+
+
 def test_heights_and_mesh_of_a_sphere(run):
     result = run("integrate", "normals.npy", "-o", "out", "--format", "ply,obj,npy,tiff")
     assert (result.code, result.err) == (0, "")
-    _, heights, inside = sphere()
-    depth = np.load("out/depth.npy")
+    inside, depth = sphere()[2], np.load("out/depth.npy")
     assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
-    assert np.array_equal(np.isfinite(depth), inside)
-    assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+    check_heights(depth)
     np.testing.assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
     report = json.loads(Path("out/surface.json").read_text())
     assert report["n_pixels"] == inside.sum()
@@ -56,8 +60,7 @@ def test_heights_and_mesh_of_a_sphere(run):
 @pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"]])
 def test_formats_of_normal_maps(run, arguments):
     assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
-    _, heights, inside = sphere()
-    assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
+    check_heights(np.load("out/depth.npy"))
 
 
 @pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
@@ -83,7 +86,7 @@ def test_an_array_of_something_else(run):
 
 @pytest.mark.parametrize("where", ["mask", "alpha"])
 def test_a_background_that_is_not_black(run, where):
-    normals, heights, inside = sphere()
+    normals, _, inside = sphere()
     picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(np.uint16)[..., ::-1]
     cut = inside.astype(np.uint16) * 65_535
     cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
@@ -94,9 +97,7 @@ def test_a_background_that_is_not_black(run, where):
         assert (refused.code, "these are no normals" in refused.err) == (3, True)
         arguments += ["--mask", "mask.png"]
     assert run(*arguments).code == 0
-    depth = np.load("out/depth.npy")
-    assert np.array_equal(np.isfinite(depth), inside)
-    assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+    check_heights(np.load("out/depth.npy"))
 
 
 def write_depth(form: str, depth: np.ndarray) -> str:
@@ -138,20 +139,15 @@ def test_a_bad_prior(run, case):
     assert (result.code, message in result.err, Path("out/surface.json").exists()) == (3, True, False), result.err
 
 
-def test_a_prior_that_breaks_off(run):
-    """The library prints warnings, which belong neither to stdout nor to stderr."""
-    prior = write_depth("exr", np.ones(SHAPE, np.float32))
-    whole = Path(prior).read_bytes()
-    Path(prior).write_bytes(whole[: len(whole) // 2])
-    result = run("integrate", "normals.png", "--prior", prior, "-o", "out")
-    assert (result.code, result.out, result.err.count("\n"), "cannot be read" in result.err) == (3, "", 1, True), result
-
-
-def test_a_damaged_prior(run):
-    for name in ("prior.npy", "prior.tif", "prior.exr"):
-        Path(name).write_bytes(b"\x93NUMPY\x01\x00garbage")
-        result = run("integrate", "normals.png", "--prior", name, "-o", "out")
-        assert (result.code, name in result.err) == (3, True), result.err
+@pytest.mark.parametrize("form", ["npy", "tif", "exr"])
+def test_a_damaged_prior(run, form):
+    """The libraries print warnings, which belong neither to stdout nor to stderr."""
+    prior = Path(write_depth(form, np.ones(SHAPE, np.float32)))
+    whole = prior.read_bytes()
+    for content in (b"\x93NUMPY\x01\x00garbage", whole[: len(whole) // 2]):
+        prior.write_bytes(content)
+        result = run("integrate", "normals.png", "--prior", prior, "-o", "out")
+        assert (result.code, result.out, result.err.count("\n"), prior.name in result.err) == (3, "", 1, True), result
     assert run("integrate", "normals.png", "--prior-detail", "9", "-o", "out").code == 2
 
 
@@ -190,12 +186,8 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
 
 def test_a_part_in_colour_by_perspective(run):
     trimesh = pytest.importorskip("trimesh")
-    half = np.zeros(SHAPE, np.uint8)
-    half[:, :25] = 255
-    cv2.imwrite("half.png", half)
-    picture = np.zeros((*SHAPE, 3), np.uint8)
-    picture[..., 2] = 200  # red, in OpenCV's order
-    cv2.imwrite("red.png", picture)
+    cv2.imwrite("half.png", np.tile(np.uint8(255) * (np.arange(SHAPE[1]) < 25), (SHAPE[0], 1)))
+    cv2.imwrite("red.png", np.tile(np.uint8((0, 0, 200)), (*SHAPE, 1)))  # in OpenCV's order
     Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n0 0 1\n")
     options = ["--mask", "half.png", "--colours", "red.png", "--camera-matrix", "camera.txt"]
     report = json.loads(run("integrate", "normals.npy", *options, "-o", "out", "--json").out)
@@ -247,9 +239,7 @@ def test_a_picture_of_the_depth(run):
 def test_a_decimated_mesh_and_its_textures(run):
     import trimesh
 
-    green = np.zeros((*SHAPE, 3), np.uint8)
-    green[..., 1] = 180
-    cv2.imwrite("albedo.png", green)
+    cv2.imwrite("albedo.png", np.tile(np.uint8((0, 180, 0)), (*SHAPE, 1)))
     arguments = ["--colours", "albedo.png", "--decimate", 100, "--format", "glb,ply,obj", "--json"]
     report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
     assert (report["normal_texture"], report["colours"]) == (True, "albedo.png")
@@ -313,12 +303,10 @@ def test_a_damaged_report_is_named(run, capture, where, key, value):
 
 def test_refusals(refuse):
     np.save("flat.npy", np.ones(SHAPE))
-    dot = np.zeros((*SHAPE, 3), np.float32)
-    dot[3, 3, 2] = 1
+    dot, corner = np.zeros((*SHAPE, 3), np.float32), np.zeros(SHAPE, np.uint8)
+    dot[3, 3, 2], corner[0, 0] = 1, 255
     np.save("dot.npy", dot)
     cv2.imwrite("small.png", np.full((10, 10), 255, np.uint8))
-    corner = np.zeros(SHAPE, np.uint8)
-    corner[0, 0] = 255
     cv2.imwrite("corner.png", corner)
     Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n")
     Path("mirrored.txt").write_text("-200 0 24.5\n0 200 19.5\n0 0 1\n")

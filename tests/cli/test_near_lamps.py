@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from cli.test_schema import check
 from scenes import BUMP_LAMPS, BUMP_MM, write_bump
 
 
@@ -16,24 +17,23 @@ def bump(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write_bump(Path("bump"))
 
 
+def mean_error(run, *arguments: object) -> float:
+    return infer(run, *arguments)["angular_error_deg"]["mean"]
+
+
 def infer(run, *arguments: object) -> dict:
     result = run("infer", "bump", "--method", "ls", "--json", "--overwrite", *map(str, arguments))
     assert result.code == 0, result.err
     return json.loads(result.out)[0]
 
 
-def mean_error(report: dict) -> float:
-    return report["angular_error_deg"]["mean"]
-
-
-def test_one_distance_for_all_lamps(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_one_distance_for_all_lamps(run, bump: Path) -> None:
     positions = 170 * BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
-    folder = write_bump(Path("bump"), positions)
-    np.savetxt(folder / "light_directions.txt", positions / 170)
-    assert mean_error(infer(run, "--light-distance", 170, "--object-width", BUMP_MM)) < 0.1
-    assert mean_error(infer(run)) > 5
-    assert mean_error(infer(run, "--light-distance", 200, "--object-width", BUMP_MM)) < 3
+    write_bump(bump, positions)
+    np.savetxt(bump / "light_directions.txt", positions / 170)
+    assert mean_error(run, "--light-distance", 170, "--object-width", BUMP_MM) < 0.1
+    assert mean_error(run) > 5
+    assert mean_error(run, "--light-distance", 200, "--object-width", BUMP_MM) < 3
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def near(bump: Path) -> Path:
 
 def test_files_and_options_mean_the_same(run, near: Path) -> None:
     report = infer(run)
-    assert mean_error(report) < 0.1
+    assert report["angular_error_deg"]["mean"] < 0.1
     assert report["warnings"] == []
     assert report["near_lamps"]["pixel_size"] == 2
     assert report["near_lamps"]["distances"] == pytest.approx(np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3)
@@ -60,11 +60,11 @@ def test_files_and_options_mean_the_same(run, near: Path) -> None:
         (near / name).unlink()
     np.savetxt("lamps.txt", BUMP_LAMPS)
     for scale in (("--pixel-size", 2), ("--object-width", BUMP_MM)):
-        assert mean_error(infer(run, "--light-positions", "lamps.txt", *scale)) < 0.1
+        assert mean_error(run, "--light-positions", "lamps.txt", *scale) < 0.1
     np.save("lamps.npy", BUMP_LAMPS)
-    assert mean_error(infer(run, "--light-positions", "lamps.npy", "--pixel-size", 2)) < 0.1
+    assert mean_error(run, "--light-positions", "lamps.npy", "--pixel-size", 2) < 0.1
     # The same file as directions: distant lights, and without a scale nothing to warn of.
-    assert mean_error(infer(run, "--lights", "lamps.txt")) > 5
+    assert mean_error(run, "--lights", "lamps.txt") > 5
 
 
 def test_distant_lights_despite_positions_are_warned_of(run, near: Path) -> None:
@@ -86,6 +86,7 @@ REFUSED = [
     ("--light-distance 170 --light-positions l.txt", 2, "contradict each other"),
     ("--pixel-size 1 --object-width 2 --light-distance 3", 2, "contradict each other"),
     ("--pixel-size -1", 2, "the pixel size is -1, expected a number above 0"),
+    ("--surface --pixel-size 1e9", 2, "the pixel size is 1e+09 mm, expected"),
     ("--pixel-size 1", 2, "--pixel-size concerns near lamps, and bump has no light_positions.txt"),
     ("--light-positions l.txt --lights l.txt", 2, "contradict each other"),
     ("--light-positions missing.txt", 3, "missing.txt: the file does not exist"),
@@ -129,14 +130,15 @@ def test_a_file_of_lobes(run, near: Path) -> None:
     (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
     assert "other input files" in run("infer", "bump", "--method", "ls").err
     even = infer(run)
+    check(even, "report")
     assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
-    assert mean_error(even) == pytest.approx(mean_error(without), abs=1e-3)
+    assert even["angular_error_deg"]["mean"] == pytest.approx(without["angular_error_deg"]["mean"], abs=1e-3)
     (near / "light_lobes.txt").write_text("0 0.2 -1 5\n")
     narrow = infer(run)
-    assert mean_error(narrow) > mean_error(without) + 0.1
+    assert narrow["angular_error_deg"]["mean"] > without["angular_error_deg"]["mean"] + 0.1
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS * (1, -1, 1))
     (near / "light_lobes.txt").write_text("0 -0.2 -1 5\n")
-    assert mean_error(infer(run, "--light-frame", "y-down")) == mean_error(narrow)
+    assert mean_error(run, "--light-frame", "y-down") == narrow["angular_error_deg"]["mean"]
 
 
 @pytest.mark.parametrize("command", ["infer", "info"])
@@ -170,8 +172,7 @@ def test_evaluate_and_prepare(run, near: Path) -> None:
     assert max(error("--n-lights 5"), error("--n-lights 5 --max-pixels 50")) < 0.2
     assert error("--n-lights all --light-noise-deg 4") > 0.5
     refused = run("prepare", "bump", "-o", "set")
-    assert refused.code == 3
-    assert "near lamps, and training needs distant lights" in refused.err
+    assert refused.code == 3 and "near lamps, and training needs distant lights" in refused.err
 
 
 def test_albedo_and_saturation(run, near: Path) -> None:
@@ -181,6 +182,6 @@ def test_albedo_and_saturation(run, near: Path) -> None:
         cv2.imwrite(str(path), np.minimum(image, 26_000))
     stored = infer(run, "--white-level", "26000", "--as-stored")
     restored = infer(run, "--white-level", "26000", "--maps", "albedo")
-    assert mean_error(restored) < 0.5 * mean_error(stored)
+    assert restored["angular_error_deg"]["mean"] < 0.5 * stored["angular_error_deg"]["mean"]
     albedo = np.load("out/bump/albedo.npy")
     assert albedo.std() < 0.03 * albedo.mean()

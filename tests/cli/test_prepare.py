@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from capture.layouts.test_cyclesps import normals, write_object
+from kills import content
 
 
 @pytest.fixture
@@ -32,9 +33,8 @@ def test_a_capture(run, capture, truth):
     mask = found["mask"]
     assert (mask.shape, mask.sum()) == ((24, 24), 448)
     np.testing.assert_allclose(found["normals"], truth[mask], atol=1e-6)
-    np.testing.assert_allclose(
-        found["observations"], (truth[mask] @ found["light_directions"].T) * 60_000 / 65_535, atol=1e-5
-    )
+    expected = (truth[mask] @ found["light_directions"].T) * 60_000 / 65_535
+    np.testing.assert_allclose(found["observations"], expected, atol=1e-5)
 
 
 def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_images):
@@ -60,8 +60,7 @@ def test_the_same_command_continues(run, make_capture):
     shutil.move(two / "image3.png", "hidden.png")
     result = run("prepare", one, two, "-o", "set")
     # The good capture is in the set, and the bad one is named.
-    assert result.code == 3
-    assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
+    assert result.code == 3 and result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
     assert "two" in result.err
     before = Path("set/one/observations.npy").stat()
     shutil.move("hidden.png", two / "image3.png")
@@ -82,20 +81,18 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     assert [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")] == before
 
 
-def change_ambient(capture: Path) -> None:
-    cv2.imwrite(str(capture / "ambient.png"), np.full((24, 24), 600, np.uint16))
+CHANGES = {
+    "ambient": lambda folder: cv2.imwrite(str(folder / "ambient.png"), np.full((24, 24), 600, np.uint16)),
+    "truth": lambda folder: np.save(folder / "normals_gt.npy", np.load(folder / "normals_gt.npy")[::-1]),
+}
 
 
-def change_ground_truth(capture: Path) -> None:
-    np.save(capture / "normals_gt.npy", np.load(capture / "normals_gt.npy")[::-1])
-
-
-@pytest.mark.parametrize("change", [change_ambient, change_ground_truth])
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture, change):
     one, two = make_capture("one"), make_capture("two")
     run("prepare", one, "-o", "set", "--quiet")
     before = arrays("one")
-    change(one)
+    CHANGES[change](one)
     result = run("prepare", one, two, "-o", "set", "--json")
     # The stale entry is kept and named, and the other capture is added.
     summary = json.loads(result.out)
@@ -117,11 +114,9 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
     assert run("prepare", capture, "-o", "set", "--quiet").code == 0
     assert run("prepare", capture, "-o", "raw", "--as-stored", "--quiet").code == 0
-    recipes = [
-        json.loads((Path(folder) / "manifest.json").read_text())["entries"][0]["recipe"]["reading"]
-        for folder in ("set", "raw")
-    ]
-    assert recipes == ["restored", "as stored"]
+    for folder, reading in (("set", "restored"), ("raw", "as stored")):
+        (entry,) = json.loads(Path(folder, "manifest.json").read_text())["entries"]
+        assert entry["recipe"]["reading"] == reading
     found = arrays("sphere")
     stored = np.load("raw/sphere/observations.npy")
     # The oracle: a matte sphere.
@@ -131,8 +126,7 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     np.testing.assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
     refused = run("prepare", capture, "-o", "raw")
-    assert refused.code == 5
-    assert "was made with reading = 'as stored', not 'restored'" in refused.err
+    assert refused.code == 5 and "was made with reading = 'as stored', not 'restored'" in refused.err
 
 
 @pytest.fixture
@@ -152,8 +146,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
     arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
-    assert result.code == 0
-    assert result.out.startswith("set: 6 entries of 2 scenes, ")
+    assert result.code == 0 and result.out.startswith("set: 6 entries of 2 scenes, ")
     assert result.err.count(", 20 lights, rendered: ") == 6
     for kind in ("diffuse", "specular", "metallic"):
         found = arrays(f"cube-{kind}")
@@ -171,10 +164,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
     assert Path("set/scene0001-diffuse").is_dir()
     refused = run(*arguments, "--scenes", 2, "--seed", 1)
-    assert (refused.code, refused.err) == (
-        5,
-        "splinecli: set: the entry cube-diffuse was made with seed = 0, not 1. Choose another -o.\n",
-    )
+    assert (refused.code, "the entry cube-diffuse was made with seed = 0, not 1. Choose" in refused.err) == (5, True)
 
 
 def test_workers_render_the_same_set(run, cube):
@@ -187,11 +177,7 @@ def test_workers_render_the_same_set(run, cube):
     assert run(*arguments, "-o", "set", "-q").code == 0
     together = run(*arguments, *more, "-o", "set", "--workers", 2)
     assert (together.code, together.err) == (0, alone.err)
-    files = [
-        {path.relative_to(folder): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
-        for folder in ("alone", "set")
-    ]
-    assert files[0] == files[1]
+    assert content(Path("alone")) == content(Path("set"))
 
 
 def test_a_mesh_that_the_camera_cannot_see(run, cube):

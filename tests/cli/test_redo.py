@@ -31,37 +31,31 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     captures = ("sphere", "second", "third")
     first = run("infer", *captures, "--method", "ls")
     assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
-    before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
+    before = [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
     broken.write_bytes(whole)
     Path("out", f".index.html.x{UNFINISHED}").touch()  # a killed process was writing this
     again = run("infer", *captures, "--method", "ls")
-    assert again.code == 0
-    assert f"splinecli: warning: out: {UNDONE}" in again.err
+    assert again.code == 0 and f"splinecli: warning: out: {UNDONE}" in again.err
     assert again.out.startswith("out/third: ")
     assert "out/second: already done, skipped\n" in again.err
     assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
-    assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
+    assert before == [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
     # The same in JSON has all reports.
     reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
     assert [report["capture"] for report in reports] == list(captures)
 
 
-def change_light_file(capture: Path) -> tuple[str, ...]:
-    light = capture / "light_directions.txt"
-    light.write_text(light.read_text() + "# measured anew\n")
-    return ()
-
-
-def change_the_version(capture: Path) -> tuple[str, ...]:
-    path = Path("out") / capture / "report.json"
-    path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
+def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
+    path.write_text(path.read_text().replace(old, new, 1))
     return ()
 
 
 CHANGES = {
     "made with another --n-lights": lambda _: ("--n-lights", "4"),
-    "other input files": change_light_file,
-    "made by version 0.0.": change_the_version,
+    "other input files": lambda capture: replace_in(capture / "light_directions.txt", "\n", " # anew\n"),
+    "made by version 0.0.": lambda capture: replace_in(
+        Path("out") / capture / "report.json", '"version": "', '"version": "0.0.'
+    ),
 }
 
 
@@ -183,6 +177,5 @@ def test_files_of_the_user_in_the_capture_are_kept(capture, run):
     (capture / "normals.png").write_text("drawn by hand")
     for update in ((), ("--update",)):
         result = run("infer", capture, "--method", "ls", "-o", capture.parent, *update)
-        assert result.code == 5
-        assert "sphere: contains normals.png, but no report.json" in result.err
+        assert result.code == 5 and "sphere: contains normals.png, but no report.json" in result.err
     assert (capture / "normals.png").read_text() == "drawn by hand"

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
-import numpy as np
 import pytest
 
-from scenes import BUMP_LAMPS, write_bump
 from splinecli.capture import capture_warnings
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
@@ -36,16 +34,6 @@ def test_reports_of_infer(capture, run, arguments):
     assert Path(written["light_file"]) == (capture / "light_directions.txt").absolute()
     assert Path(written["folder"]) == Path.cwd() / "out/sphere"
     assert all((Path(written["folder"]) / name).is_file() for name in written["files"])
-
-
-def test_reports_of_near_lamps(run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    folder = write_bump(Path("bump"))
-    np.savetxt(folder / "light_positions.txt", BUMP_LAMPS)
-    (folder / "light_lobes.txt").write_text("0 0 -1 2\n")
-    [report] = json.loads(run("infer", "bump", "--pixel-size", 2, "--method", "ls", "--json").out)
-    check(report, "report")
-    assert report["near_lamps"]["lobes"] == [[0, 0, -1, 2]] * len(BUMP_LAMPS)
 
 
 def test_reports_of_integrate(capture, run):

@@ -27,12 +27,6 @@ def small_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Saving without drawing, which takes longer than all of such a run."""
-    monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
-
-
 def rows() -> list[dict[str, str]]:
     with Path("run/metrics.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
@@ -44,8 +38,7 @@ FILES = {
 
 
 def settings() -> dict[str, Any]:
-    values: dict[str, Any] = json.loads(Path("run/config.json").read_text())
-    return values
+    return json.loads(Path("run/config.json").read_text())
 
 
 def write_set(folder: str, *, finished: bool = True) -> None:
@@ -114,10 +107,8 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
     monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
     result = run("train", "-o", "run", "--steps", 1, "--tensorboard")
     assert (result.code, result.out) == (2, "")
-    assert result.err == (
-        "splinecli: --tensorboard needs the package tensorboard, which is not installed."
-        " Run pip install 'splinecli[tensorboard]'.\n"
-    )
+    assert "--tensorboard needs the package tensorboard" in result.err
+    assert result.err.endswith("Run pip install 'splinecli[tensorboard]'.\n")
 
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
@@ -146,10 +137,9 @@ def test_resuming_a_finished_run_says_so(run, no_pictures):
     Path("run", f".weights.safetensors.x{UNFINISHED}").touch()  # a killed process was writing this
     result = run("train", "-o", "run", "--resume", "--steps", 1)
     assert (result.code, result.out) == (0, "run/weights.safetensors\n")
-    assert result.err == (
-        f"splinecli: warning: run: {UNDONE}\n"
-        "run: the run is at its end already. Give it more --steps or --minutes to go on.\n"
-    )
+    warning, message = result.err.splitlines()
+    assert warning == f"splinecli: warning: run: {UNDONE}"
+    assert message.startswith("run: the run is at its end already.")
     assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
 
 

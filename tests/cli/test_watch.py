@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -41,15 +42,11 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
 
 
 def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
     Path("parts").mkdir()
     capture.rename("parts/sphere")
-    monkeypatch.setattr("splinecli.pipeline.batch.run_member", interrupt)
+    monkeypatch.setattr("splinecli.pipeline.batch.run_member", Mock(side_effect=KeyboardInterrupt))
     result = run("watch", "parts", "--settle", 0, "--", "--method", "ls")
-    assert result.code == 130
-    assert "interrupted" in result.err
+    assert result.code == 130 and "interrupted" in result.err
 
 
 @pytest.mark.parametrize(
@@ -66,11 +63,9 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None
 )
 def test_wrong_options_are_refused(run, capture, options: tuple[str, ...], problem: str) -> None:
     result = run("watch", capture, "--settle", 0, "--", *options)
-    assert result.code == 2
-    assert problem in result.err
+    assert result.code == 2 and problem in result.err
 
 
 def test_no_folder(run, capture) -> None:
     result = run("watch", "nowhere")
-    assert result.code == 3
-    assert "nowhere: the folder cannot be read" in result.err
+    assert result.code == 3 and "nowhere: the folder cannot be read" in result.err

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cli.conftest import EXAMPLE
+from cli.conftest import EXAMPLE, read_report
 
 
 def write_lights(folder: Path, change) -> None:
@@ -21,13 +21,13 @@ def test_infer_names_a_flipped_axis_and_the_frame_mends_it(run, medallion):
     assert result.code == 0
     assert "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00)" in result.err
     assert "run again with --light-frame y-down." in result.err
-    report = json.loads(Path("out/medallion/report.json").read_text())
+    report = read_report(Path("out/medallion"))
     assert [warning["code"] for warning in report["warnings"]] == ["light_frame"]
     wrong = report["angular_error_deg"]["mean"]
 
     mended = run("infer", medallion, "--method", "ls", "--light-frame", "y-down", "--overwrite")
     assert (mended.code, mended.err) == (0, "")
-    report = json.loads(Path("out/medallion/report.json").read_text())
+    report = read_report(Path("out/medallion"))
     assert report["options"]["light_frame"] == "y-down"
     assert report["angular_error_deg"]["mean"] < wrong / 5
 
@@ -82,14 +82,11 @@ def test_info_lists_the_readings(run, medallion):
     assert min(orders.values()) > rows[0]["misfit"]
     write_lights(medallion, lambda lights: lights[:, [1, 0, 2]])
     wrong = run("info", medallion, "--strict", "--check-lights")
-    assert wrong.code == 3
-    assert "--light-frame exchanged" in wrong.err
+    assert wrong.code == 3 and "--light-frame exchanged" in wrong.err
     assert "x and y exchanged  " in wrong.out
     assert "in reversed order, beginning with light" in wrong.out
     assert "advantage: evidence from curl and outline" in wrong.out
-    assert "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say" in wrong.err.replace(
-        str(medallion), "medallion"
-    )
+    assert f"splinecli: {medallion}: an input is probably wrong (light_frame), as the warnings say" in wrong.err
 
 
 def test_mended_lights(run, medallion):
@@ -131,8 +128,7 @@ def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
 
     write_lights(medallion, zenith_angles)
     result = run("info", medallion, "--lights-format", "azel", "--strict", "--json")
-    assert result.code == 3
-    assert json.loads(result.out)["warning_codes"] == ["light_frame"]
+    assert result.code == 3 and json.loads(result.out)["warning_codes"] == ["light_frame"]
     assert "much better if their elevations count from the camera axis (misfit" in result.err
     assert "Replace each elevation by 90 degrees minus it." in result.err
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from scenes import halfway, spiral_lights
+from scenes import halfway, ring_lights, spiral_lights
 from splinecli.capture import Capture
 from splinecli.diagnosis.checks import check_arrays, light_spread, repeated_images
 
@@ -41,10 +41,8 @@ def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
 
 
 def test_the_spread_of_lights() -> None:
-    ring = np.array([(np.cos(a), np.sin(a), 1) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)])
-    ring /= np.sqrt(2)
     # x and y have a mean square of 1/4, z of 1/2.
-    assert light_spread(ring)[0] == pytest.approx(0.5)
+    assert light_spread(ring_lights(8, 45))[0] == pytest.approx(0.5)
     arc = np.array([(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))])
     assert light_spread(arc)[0] == pytest.approx(0.02, abs=1e-3)
     assert not light_spread(arc)[1]

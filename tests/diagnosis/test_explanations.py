@@ -71,9 +71,8 @@ def test_near_lamps(widths: float, shine: float) -> None:
 
 
 def test_too_little_is_not_judged() -> None:
-    few = Sample(scene("ball").observations[:30], np.ones((5, 6), np.bool_), 1)
-    assert found(few) == []
-    black = Sample(np.zeros((400, 10)), np.ones((20, 20), np.bool_), 1)
-    assert found(black) == []
+    few, black = scene("ball").observations[:30], np.zeros((400, 10))
+    assert found(Sample(few, np.ones((5, 6), np.bool_), 1)) == []
+    assert found(Sample(black, np.ones((20, 20), np.bool_), 1)) == []
     five = Sample(scene("relief", widths=3).observations[:, :5], np.ones((SIZE, SIZE), np.bool_), 1)
     assert encoded_values(five, LIGHTS[:5]) == [] == near_lamps(five, LIGHTS[:5])

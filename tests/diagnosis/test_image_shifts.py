@@ -49,8 +49,7 @@ def test_highlights_that_move_are_no_shift() -> None:
     slopes = np.stack((0.5 * x, 0.5 * y), axis=-1) + cv2.GaussianBlur(relief, (0, 0), 3)
     normals = np.dstack((slopes, np.ones_like(x)))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    azimuth = 2 * np.pi * np.arange(N_LIGHTS) / N_LIGHTS
-    halfway = np.stack((0.3 * np.cos(azimuth), 0.3 * np.sin(azimuth), np.full(N_LIGHTS, 0.95)), axis=1)
+    halfway = ring_lights(N_LIGHTS, np.degrees(np.arctan2(0.3, 0.95)))
     assert find_shifts(sample_of((normals @ halfway.T).clip(0) ** 60)) == []
 
 

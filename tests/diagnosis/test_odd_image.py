@@ -66,12 +66,10 @@ def test_the_other_images_are_judged_without_the_odd_one() -> None:
     normals, mask = sphere()
     observations = shade(normals, LIGHTS)
     observations[:, ODD] *= 0.2
-    check = check_lights(observations, mask, LIGHTS)
-    assert check.odd_image is not None and check.odd_image.place == ODD
-    assert (check.order, check.best) == (None, None)
-    check = check_lights(observations, mask, LIGHTS * (1, -1, 1))
-    assert check.odd_image is not None and check.odd_image.place == ODD
-    assert check.best is not None and check.best.frame == parse_light_frame("y-down")
+    for signs, frame in (((1, 1, 1), None), ((1, -1, 1), parse_light_frame("y-down"))):
+        check = check_lights(observations, mask, LIGHTS * signs)
+        assert check.odd_image is not None and check.odd_image.place == ODD
+        assert (check.order, check.best and check.best.frame) == (None, frame)
 
 
 @pytest.mark.parametrize("name", ["DiLiGenT/pmsData/ballPNG", "uw/gray", "uw/horse"])

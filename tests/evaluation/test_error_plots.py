@@ -16,14 +16,12 @@ def evaluation_of(
     captures: list[str], n_lights: int | None = 10, light_noise_deg: float = 0.0, *, all_lights: int = 96
 ) -> Evaluation:
     level = 20 / (n_lights or all_lights) + light_noise_deg
-    return Evaluation(
-        Protocol(n_lights, 3, light_noise_deg=light_noise_deg),
-        tuple(
-            Result(method, capture, n_lights or all_lights, (m + level, m + level + 0.5, m + level + 1), 1.0)
-            for capture in captures
-            for m, method in enumerate(METHODS, start=3)
-        ),
+    results = tuple(
+        Result(method, capture, n_lights or all_lights, (m + level, m + level + 0.5, m + level + 1), 1.0)
+        for capture in captures
+        for m, method in enumerate(METHODS, start=3)
     )
+    return Evaluation(Protocol(n_lights, 3, light_noise_deg=light_noise_deg), results)
 
 
 def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
@@ -37,8 +35,7 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
 )
 def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: int, down: int) -> None:
     picture = decode_rgb(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
-    assert picture.shape == (540 * down + 80, 640 * across, 3)
-    assert (picture[0] == 255).all()
+    assert picture.shape == (540 * down + 80, 640 * across, 3) and (picture[0] == 255).all()
 
 
 def test_each_method_has_its_colour_in_both_plots() -> None:

@@ -136,14 +136,14 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_p
 def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> None:
     ls = make_estimator("ls")
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
-    with pytest.raises(
-        InputError, match=r"none of the 2 captures could be scored; the first: .*untrue: the capture has no gro"
+    none = "none of the 2 captures could be scored; the first: .*untrue: the capture has no ground truth"
+    for folders, error, message in (
+        ([untrue, few], InputError, none),
+        ([untrue], InputError, "untrue: the capture has no ground truth"),
+        ([few], UsageError, "5 lights were requested, but the capture has 4"),
     ):
-        evaluate([untrue, few], [ls], Protocol(n_lights=5))
-    with pytest.raises(InputError, match="untrue: the capture has no ground truth"):
-        evaluate([untrue], [ls], Protocol())
-    with pytest.raises(UsageError, match="5 lights were requested, but the capture has 4"):
-        evaluate([few], [ls], Protocol(n_lights=5))
+        with pytest.raises(error, match=message):
+            evaluate(folders, [ls], Protocol(n_lights=5))
 
 
 def test_names_tell_captures_apart(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +204,9 @@ def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> 
     assert len(path.read_text().splitlines()) == 4
 
 
-@pytest.mark.parametrize("change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw", "reading"])
+@pytest.mark.parametrize(
+    "change", ["photograph", "lights", "method", "seed", "max_pixels", "light_noise_deg", "n_lights", "as_stored"]
+)
 def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
     folder, path = write_dome(), tmp_path / "trials.jsonl"
     settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
@@ -219,10 +221,7 @@ def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_pat
     elif change == "method":
         fake.fingerprint = "other weights"
     else:
-        name = {"seed": "seed", "pixels": "max_pixels", "noise": "light_noise_deg", "draw": "n_lights"}.get(
-            change, "as_stored"
-        )
-        settings[name] = True if change == "reading" else 5
+        settings[change] = True if change == "as_stored" else 5
     evaluate_all([folder], [fake], [Protocol(**settings)], store=TrialStore(path))
     assert fake.lights
 
@@ -243,9 +242,7 @@ def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: Wri
     assert first.mae_deg < 0.1 < second.mae_deg
 
 
-def test_noise_that_lays_lights_into_a_plane_is_drawn_again(
-    write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_noise_that_lays_lights_into_a_plane_is_drawn_again(write_dome, monkeypatch):
     sigmas: list[float] = []
 
     def tilt(lights: NDArray[np.float64], sigma_deg: float, *_: object) -> NDArray[np.float64]:
@@ -269,8 +266,6 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     every = Fake(folders[0])
     evaluate(folders, [every], Protocol(skip_first={"*": 4, "other": 1}))
     assert [len(lights) for lights in every.lights] == [4, 7]
-    with pytest.raises(UsageError, match="no capture named 'cow' to skip images of; there are bearPNG, other"):
-        evaluate(folders, [fake], Protocol(skip_first={"cow": 1}))
 
 
 def test_draws_keep_to_the_images_that_are_not_left_out(write_dome: WriteDome, tmp_path: Path) -> None:

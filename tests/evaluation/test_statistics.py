@@ -76,13 +76,7 @@ def test_every_pair_on_every_capture_and_on_their_average() -> None:
         ((4.1, 5.2), (4.1 + 1e-8, 5.2 - 1e-8), (0.0, 0.0), 1.0, False),  # but for rounding
     ],
 )
-def test_where_there_is_nothing_to_test(
-    first: tuple[float, ...],
-    second: tuple[float, ...],
-    interval: tuple[float, float] | None,
-    p_value: float | None,
-    differs: bool | None,
-) -> None:
+def test_where_there_is_nothing_to_test(first, second, interval, p_value, differs):
     for comparison in compare(evaluation_of(ball={"a": first, "b": second})):
         assert comparison.interval_deg == interval
         assert comparison.p_value == comparison.p_holm == p_value

@@ -82,8 +82,7 @@ def test_light_noise_tells_evaluations_apart() -> None:
 def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> None:
     evaluation = replace(TEN, protocol=replace(TEN.protocol, as_stored=as_stored))
     words = "images as stored." if as_stored else "images restored."
-    assert words in markdown([evaluation])
-    assert words in latex([evaluation])
+    assert words in markdown([evaluation]) and words in latex([evaluation])
     document = results_document([evaluation])
     assert document["protocol"]["as_stored"] is as_stored
     assert {record["as_stored"] for record in document["results"]} == {as_stored}

@@ -35,8 +35,7 @@ def folder(tmp_path: Path) -> Path:
 
 def mae_deg(folder: Path, lights: tuple[int, ...], **settings: bool) -> float:
     """The error of a capture under these lights, read without any other image."""
-    errors = estimate_normals(open_capture(folder).read(lights, **settings), LS).errors
-    return errors.mean
+    return estimate_normals(open_capture(folder).read(lights, **settings), LS).errors.mean
 
 
 def test_each_trial_scores_what_infer_computes_from_its_lights(folder: Path) -> None:

@@ -226,11 +226,8 @@ def main() -> int:
                 seconds = rng.uniform(0, 1.1 * command.seconds)
                 failures += _print_problems(f"{name}, {seconds:.3f} s", command.kill(seconds=seconds))
             kills += command.kill_count
-            print(
-                f"{name}: {command.kill_count} kills, at {len(steps)} of {total} steps and at random times;"
-                f" {command.new_count} ended in the new files",
-                flush=True,
-            )
+            told = f"{command.kill_count} kills, at {len(steps)} of {total} steps and at random times"
+            print(f"{name}: {told}; {command.new_count} ended in the new files", flush=True)
     print(f"{kills} kills, {failures} failed")
     return bool(failures)
 

@@ -258,9 +258,8 @@ def run_cases(
                 failed.append(f"case {number}: {', '.join(found)}\n  {what}\n  {ended.seconds:.1f} s: {last}")
                 print(failed[-1], flush=True)
                 if keep is not None:
-                    shutil.copytree(
-                        work / "case", keep / str(number), symlinks=True, ignore=_special, dirs_exist_ok=True
-                    )
+                    options = {"symlinks": True, "ignore": _special, "dirs_exist_ok": True}
+                    shutil.copytree(work / "case", keep / str(number), **options)
     return done, codes, failed
 
 

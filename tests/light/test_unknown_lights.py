@@ -27,6 +27,12 @@ def observed(directions: NDArray[np.float64], **gloss: float) -> NDArray[np.floa
     return shade(NORMALS[INSIDE], directions, noise=0.002, **gloss).astype(np.float32)
 
 
+def images_of(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    images = np.zeros((len(observations.T), SIZE, SIZE), np.float32)
+    images[:, INSIDE] = observations.T
+    return images
+
+
 def mean_angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
     return float(angle_between_deg(found, true).mean())
 
@@ -54,8 +60,7 @@ def test_intensities_are_found_with_the_directions() -> None:
 def test_a_turned_camera_turns_the_lights() -> None:
     """All eight turns and mirror images are seen, so none is preferred."""
     true = lights()
-    images = np.zeros((10, SIZE, SIZE), np.float32)
-    images[:, INSIDE] = observed(true, gloss=0.3).T
+    images = images_of(observed(true, gloss=0.3))
     inside = INSIDE.copy()
     inside[: SIZE // 4] = False  # no symmetric outline
     straight = find_lights(np.ascontiguousarray(images[:, inside].T), inside, True)
@@ -154,17 +159,17 @@ def test_confidence_includes_the_lights() -> None:
 
 def test_python() -> None:
     true = lights()
-    images = np.zeros((10, SIZE, SIZE), np.float32)
-    images[:, INSIDE] = observed(true).T
+    images = images_of(observed(true))
     estimate = estimate_normals(images, None, INSIDE, method="ls")
     capture = estimate.capture
     assert ESTIMATED_LIGHTS in [warning.code for warning in capture.warnings]
     assert capture.light_errors_deg is not None and capture.light_errors_deg.shape == (10,)
     errors = angle_between_deg(estimate.normal_map[INSIDE], NORMALS[INSIDE])
     assert np.median(errors) < mean_angle(capture.light_directions, true) + 3
-    with pytest.raises(UsageError, match="near lamps need positions"):
-        estimate_normals(images, None, INSIDE, pixel_size=1.0)
-    with pytest.raises(UsageError, match="first_light is for lights that are found"):
-        estimate_normals(images, true, INSIDE, first_light="left")
-    with pytest.raises(UsageError, match="first light"):
-        estimate_normals(images, None, INSIDE, first_light="north")  # type: ignore[arg-type]
+    for lights_given, options, message in (
+        (None, {"pixel_size": 1.0}, "near lamps need positions"),
+        (true, {"first_light": "left"}, "first_light is for lights that are found"),
+        (None, {"first_light": "north"}, "first light"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            estimate_normals(images, lights_given, INSIDE, **options)

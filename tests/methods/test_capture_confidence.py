@@ -7,6 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.confidence import CaptureFeatures, capture_features
 from splinecli.inference import NormalEstimate, estimate_normals
@@ -25,9 +26,7 @@ WIDTH = float(SIZE)
 
 def draw_lights(count: int = 12) -> Doubles:
     rng = np.random.default_rng(1)
-    z, azimuth = rng.uniform(0.5, 0.95, count), np.arange(count) * 2.4
-    radius = np.sqrt(1 - z * z)
-    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
+    return directions_at(np.arange(count) * 2.4, np.arccos(rng.uniform(0.5, 0.95, count)))
 
 
 def relief(lights: Doubles, *, widths: float | None = None) -> Capture:
@@ -124,10 +123,9 @@ def test_the_claim_falls_with_the_truth() -> None:
 
 
 def test_what_cannot_be_judged() -> None:
-    few = relief(draw_lights()).choose_lights((0, 2, 5, 9))
-    assert not claim(few)[0].capture_judged
-    tiny = relief(draw_lights()).choose_pixels(np.arange(30))
-    assert not claim(tiny)[0].capture_judged
+    capture = relief(draw_lights())
+    for part in (capture.choose_lights((0, 2, 5, 9)), capture.choose_pixels(np.arange(30))):
+        assert not claim(part)[0].capture_judged
     assert capture_head("0" * 64) is None
     assert capture_head(manifest()["cnn-ps"]["sha256"]) is None
 

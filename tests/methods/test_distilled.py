@@ -78,10 +78,19 @@ def distant(observations: NDArray[np.float32]) -> LightOf:
     return lambda rows: LampLight(observations[rows], LIGHTS)
 
 
+def learn(teacher: Teacher, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
+    return distil(teacher, distant(teacher.observations), len(teacher.observations), size, **options)
+
+
+def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2) -> Teacher:
+    """A teacher who expects the same error everywhere."""
+    return Teacher(observations, normals, np.tile(log_median(degrees), (len(normals), 1)))
+
+
 def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
     normals, observations = glossy()
-    teacher = Teacher(observations, noisy(normals, 4), np.tile(log_median(4), (8000, 1)))
-    found = distil(teacher, distant(observations), len(observations), SIZE)
+    teacher = sure(observations, noisy(normals, 4), 4)
+    found = learn(teacher)
     assert tells_confidence(found)
     error = angle_between_deg(found.estimate(observations, LIGHTS), normals).mean()
     assert angle_between_deg(teacher.normals, normals).mean() == pytest.approx(4, abs=0.1)
@@ -104,11 +113,11 @@ def test_lamps_near_a_plane_of_bumps() -> None:
     directions = towards / np.linalg.norm(towards, axis=2, keepdims=True)
     shading = np.einsum("pfc,pc->pf", directions, normals).clip(0)
     observations = (shading + 0.3 * shading**8).astype(np.float32)
-    teacher = Teacher(observations, noisy(normals, 4), np.tile(log_median(4), (8000, 1)))
+    teacher = sure(observations, noisy(normals, 4), 4)
     found = distil(teacher, lambda rows: LampLight(observations[rows], directions[rows]), 8000, SIZE)
     assert angle_between_deg(found.estimate(observations, directions), normals).mean() < 4 / 2
     assert angle_between_deg(LeastSquares().estimate(observations, directions), normals).mean() > 4
-    far = distil(teacher, distant(observations), 8000, SIZE)
+    far = learn(teacher)
     assert far.distillation.mean_deg > 1.3 * found.distillation.mean_deg
 
 
@@ -117,7 +126,7 @@ def test_it_learns_where_its_teacher_is_unsure() -> None:
     dull = np.arange(6000) % 2 == 0
     observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
     errors = np.where(dull[:, None], log_median(1), log_median(12))
-    found = distil(Teacher(observations, normals, errors), distant(observations), len(observations), SIZE)
+    found = learn(Teacher(observations, normals, errors))
     learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
     truth = confidence(errors.astype(np.float32))
     assert np.abs(learned[dull].mean() - truth[dull].mean()) < 0.1
@@ -130,8 +139,8 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
     rare = np.arange(20_000) % 1000 == 3
     observations[rare] = observations[rare][:, ::-1] ** 4
     taught = np.where(rare[:, None], np.array((0.6, 0.0, 0.8)), normals)
-    teacher = Teacher(observations, taught, np.tile(log_median(2), (20_000, 1)))
-    found = distil(teacher, distant(observations), len(observations), SIZE)
+    teacher = sure(observations, taught)
+    found = learn(teacher)
     angles = angle_between_deg(found.estimate(observations, LIGHTS), taught)
     assert (angles[rare] < 1e-3).mean() > 0.9
     assert found.n_unlike <= 0.01 * 20_000
@@ -141,25 +150,19 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
 def test_dark_pixels_have_no_normal() -> None:
     normals, observations = glossy(3000)
     observations[::100] = 0
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-    estimate, errors = distil(teacher, distant(observations), len(observations), SIZE).estimate_with_error(
-        observations, LIGHTS
-    )
+    teacher = sure(observations, normals)
+    estimate, errors = learn(teacher).estimate_with_error(observations, LIGHTS)
     np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
     np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     normals, observations = glossy(3000)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-
-    def run(seed: int) -> DistilledEstimator:
-        return distil(teacher, distant(observations), len(observations), SMALL, seed=seed)
-
+    teacher = sure(observations, normals)
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)
-    first, again, other = (run(seed).estimate(observations, LIGHTS) for seed in (1, 1, 2))
+    first, again, other = (learn(teacher, SMALL, seed=seed).estimate(observations, LIGHTS) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
     assert torch.equal(torch.rand(3), expected)
@@ -167,19 +170,19 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
 
 def test_its_map_is_refined_by_its_teacher() -> None:
     normals, observations = glossy(3000)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-    assert refiner_of(distil(teacher, distant(observations), len(observations), SMALL)) is None
+    teacher = sure(observations, normals)
+    assert refiner_of(learn(teacher, SMALL)) is None
     teacher.refiner = NetworkRefiner(RefineNet(), "float32")  # type: ignore[attr-defined]
-    refiner = refiner_of(distil(teacher, distant(observations), len(observations), SMALL))
+    refiner = refiner_of(learn(teacher, SMALL))
     assert refiner is teacher.refiner  # type: ignore[attr-defined]
 
 
 def test_too_few_pixels() -> None:
     """The sample is half of the lit pixels at most: of 127, 63."""
     normals, observations = glossy(127)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (127, 1)))
+    teacher = sure(observations, normals)
     with pytest.raises(UsageError, match="127 pixels are lit, too few to distil the network"):
-        distil(teacher, distant(observations), len(observations), SIZE)
+        learn(teacher)
 
 
 def test_sizes_grow_with_the_capture() -> None:

@@ -56,6 +56,10 @@ def direct_and_indirect(
     return direct.astype(np.float32), (ALBEDO * arriving).astype(np.float32)
 
 
+DIRECT, INDIRECT = direct_and_indirect(BOWL)
+CAPTURE = Capture("bowl", DIRECT + INDIRECT, LIGHTS, tuple(range(10)), MASK)
+
+
 def found_in(
     normals: NDArray[np.floating], observations: Floats, lights: NDArray[np.floating] = LIGHTS
 ) -> IndirectLight | None:
@@ -65,7 +69,7 @@ def found_in(
 
 
 def test_a_bowls_light_on_itself_is_found_at_any_exposure() -> None:
-    direct, indirect = (np.float32(5) * light for light in direct_and_indirect(BOWL))
+    direct, indirect = 5 * DIRECT, 5 * INDIRECT
     found = found_in(BOWL, direct + indirect)
     ratio = (found.at(EVERYWHERE) / indirect)[INSIDE]
     assert ratio.mean() == pytest.approx(1, abs=0.05)
@@ -82,24 +86,23 @@ def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None
     lamps = NearLamps.of(distances * LIGHTS, 2 / SIZE, (SIZE, SIZE), equal=False, camera_matrix=camera_matrix)
     lamps = replace(lamps, points=points.astype(np.float32))
     direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
-    found = find_indirect_light(
-        MASK,
-        direct + indirect,
-        lambda rows: LampLight.of((direct + indirect)[rows], lamps.choose_pixels(rows)),
-        BOWL.astype(np.float32),
-    )
+    seen = direct + indirect
+
+    def light_of(rows: NDArray[np.integer]) -> LampLight:
+        return LampLight.of(seen[rows], lamps.choose_pixels(rows))
+
+    found = find_indirect_light(MASK, seen, light_of, BOWL.astype(np.float32))
     assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
 
 def test_a_dark_background_changes_nothing() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    alone = found_in(BOWL, direct + indirect)
+    alone = found_in(BOWL, DIRECT + INDIRECT)
     mask = np.ones((640, 640), np.bool_)
     normals = np.tile(np.array((0, 0, 1), np.float32), (*mask.shape, 1))
     observations = np.full((*mask.shape, 10), 0.002, np.float32)
     place = np.zeros_like(mask)
     place[320:384, 320:384] = MASK
-    normals[place], observations[place] = BOWL, direct + indirect
+    normals[place], observations[place] = BOWL, DIRECT + INDIRECT
     normals, observations = normals[mask], observations[mask]
     found = find_indirect_light(mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals)
     ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
@@ -107,46 +110,40 @@ def test_a_dark_background_changes_nothing() -> None:
 
 
 def test_a_ball_receives_none_even_with_ambient_light() -> None:
-    direct, _ = direct_and_indirect(OUTWARDS)
+    direct = direct_and_indirect(OUTWARDS)[0]
     assert found_in(OUTWARDS, direct) is None
     assert found_in(OUTWARDS, direct + np.float32(0.05)) is None
 
 
 def test_ambient_light_is_separated_from_indirect_light() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    found = found_in(BOWL, direct + indirect + (0.03 * ALBEDO).astype(np.float32))
-    assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.15)
+    found = found_in(BOWL, DIRECT + INDIRECT + (0.03 * ALBEDO).astype(np.float32))
+    assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == pytest.approx(1, abs=0.15)
 
 
 def test_nothing_is_removed_where_shadows_do_not_show_it() -> None:
     """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow something else."""
-    direct, indirect = direct_and_indirect(BOWL)
-    assert found_in(BOWL, direct) is None
-    noise = np.random.default_rng(0).random(direct.shape, np.float32) / ALBEDO.astype(np.float32)
-    assert found_in(BOWL, np.where(direct > 0, direct, indirect * noise)) is None
-    assert found_in(BOWL, np.zeros_like(direct)) is None
+    assert found_in(BOWL, DIRECT) is None
+    noise = np.random.default_rng(0).random(DIRECT.shape, np.float32) / ALBEDO.astype(np.float32)
+    assert found_in(BOWL, np.where(DIRECT > 0, DIRECT, INDIRECT * noise)) is None
+    assert found_in(BOWL, np.zeros_like(DIRECT)) is None
 
 
 def test_no_more_is_removed_than_the_brightest_albedo_allows() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    found = found_in(BOWL, direct + 20 * indirect)
+    found = found_in(BOWL, DIRECT + 20 * INDIRECT)
     assert 1.3 < found.albedo.max() < 1.6
 
 
 def test_few_pixels_lose_what_is_negligible() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    found = found_in(BOWL, direct + indirect)
-    assert found.counts_at(direct + indirect, EVERYWHERE)[INSIDE].all()
-    assert not found.counts_at(100 * (direct + indirect), EVERYWHERE).any()
+    found = found_in(BOWL, DIRECT + INDIRECT)
+    assert found.counts_at(DIRECT + INDIRECT, EVERYWHERE)[INSIDE].all()
+    assert not found.counts_at(100 * (DIRECT + INDIRECT), EVERYWHERE).any()
 
 
 def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    capture = Capture("bowl", direct + indirect, LIGHTS, tuple(range(10)), MASK)
     estimator = make_estimator("spline-net")
 
     def mean_error_deg() -> float:
-        found = estimate_normals(capture, estimator).normal_map[MASK]
+        found = estimate_normals(CAPTURE, estimator).normal_map[MASK]
         return float(angle_between_deg(found, BOWL).mean())
 
     without = mean_error_deg()
@@ -155,8 +152,6 @@ def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
 
 
 def test_the_refinement_sees_what_is_left() -> None:
-    direct, indirect = direct_and_indirect(BOWL)
-    capture = Capture("bowl", direct + indirect, LIGHTS, tuple(range(10)), MASK)
     stages = []
 
     def stage(name: str) -> AbstractContextManager[Progress]:
@@ -172,6 +167,6 @@ def test_the_refinement_sees_what_is_left() -> None:
 
     seen: list[Floats] = []
     with patch.object(NetworkRefiner, "refine", refine):
-        estimate_normals(capture, make_estimator("spline-net"), stage=stage)
-    assert np.abs(seen[0] - direct)[INSIDE].mean() < 0.5 * indirect.mean()
+        estimate_normals(CAPTURE, make_estimator("spline-net"), stage=stage)
+    assert np.abs(seen[0] - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
     assert stages == [["removing indirect light", len(BOWL)], ["refining", 0]]

@@ -11,7 +11,7 @@ from scenes import spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.window import Window
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.inference import estimate_normals
 from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator, near_light
 from splinecli.methods.near_light import Blocks, find_surface
@@ -59,23 +59,21 @@ def near(kind: str, distance: float, side: int = SIDE) -> Capture:
     return replace(capture, lamps=NearLamps.of(positions, 2 / side, capture.mask.shape, equal=True))
 
 
-def error_deg(estimate: NormalEstimate) -> float:
-    return estimate.errors.mean
+def error_deg(capture: Capture) -> float:
+    return estimate_normals(capture, make_estimator("iw12")).errors.mean
 
 
 @pytest.mark.parametrize(("kind", "limit_deg"), [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
 def test_lamps_at_two_widths(kind: str, limit_deg: float) -> None:
     """Exact data give exact normals, apart from the integration, whose error is that of a grid of 40 x 40 pixels."""
     capture = near(kind, 4.0)
-    assert error_deg(estimate_normals(capture, make_estimator("iw12"))) < limit_deg
-    assert error_deg(estimate_normals(replace(capture, lamps=None), make_estimator("iw12"))) > 10
+    assert error_deg(capture) < limit_deg
+    assert error_deg(replace(capture, lamps=None)) > 10
 
 
 def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
-    capture = near("dome", 4.0)
-    in_millimetres = replace(
-        capture, lamps=NearLamps.of(500 * capture.lamps.positions, 1000 / SIDE, (SIDE, SIDE), equal=True)
-    )
+    lamps = NearLamps.of(500 * 4.0 * LIGHTS, 1000 / SIDE, (SIDE, SIDE), equal=True)
+    in_millimetres = replace(near("dome", 4.0), lamps=lamps)
     lamps = find_surface(in_millimetres).lamps
     points, _, _ = surface("dome")
     # The rim of the dome is steep: half a pixel is 12 there.
@@ -89,12 +87,10 @@ def test_intensities_hold_at_the_origin() -> None:
     positions = LIGHTS * distances[:, None]
     capture = capture_of(*surface("dome"), positions, np.ones(10))
     equal = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=True)
-    estimator = make_estimator("iw12")
-    assert error_deg(estimate_normals(replace(capture, lamps=equal), estimator)) < 0.2
+    assert error_deg(replace(capture, lamps=equal)) < 0.2
     at_origin = capture.observations * (distances**2).astype(np.float32)
     measured = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=False)
-    estimate = estimate_normals(replace(capture, observations=at_origin, lamps=measured), estimator)
-    assert error_deg(estimate) < 0.2
+    assert error_deg(replace(capture, observations=at_origin, lamps=measured)) < 0.2
 
 
 @pytest.mark.parametrize("equal", [True, False])
@@ -115,9 +111,8 @@ def test_lamps_that_shine_in_lobes(equal: bool) -> None:
     capture = capture_of(points, normals, mask, positions, shown)
     lobes = np.column_stack((axes, exponents))
     lamps = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=equal, lobes=lobes)
-    estimator = make_estimator("iw12")
-    assert error_deg(estimate_normals(replace(capture, lamps=lamps), estimator)) < 0.2
-    assert error_deg(estimate_normals(replace(capture, lamps=replace(lamps, lobes=None)), estimator)) > 2
+    assert error_deg(replace(capture, lamps=lamps)) < 0.2
+    assert error_deg(replace(capture, lamps=replace(lamps, lobes=None))) > 2
 
 
 def test_a_perspective_camera() -> None:
@@ -133,11 +128,9 @@ def test_a_perspective_camera() -> None:
     normals = np.tile(normal, (len(points), 1))
     capture = capture_of(points - middle, normals, mask, positions, np.ones(10))
     lamps = NearLamps.of(positions, pixel_size, mask.shape, equal=True, camera_matrix=MATRIX)
-    estimate = estimate_normals(replace(capture, lamps=lamps), make_estimator("iw12"))
     # Depth is known up to its geometric mean, which is not exactly the depth of the middle.
-    assert error_deg(estimate) < 0.3
-    orthographic = replace(lamps, camera_matrix=None)
-    assert error_deg(estimate_normals(replace(capture, lamps=orthographic), make_estimator("iw12"))) > 1
+    assert error_deg(replace(capture, lamps=lamps)) < 0.3
+    assert error_deg(replace(capture, lamps=replace(lamps, camera_matrix=None))) > 1
 
 
 @pytest.mark.parametrize(("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)])
@@ -148,14 +141,9 @@ def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, 
     left, top, *_ = box or (0, 0)
     mask = window.of(capture.mask)
     rows = (window.whole(mask) & capture.mask)[capture.mask]
-    part = replace(
-        capture,
-        observations=capture.observations[rows],
-        mask=mask,
-        ground_truth=window.of(capture.ground_truth),
-        lamps=capture.lamps.within(left, top, 2, None),
-    )
-    assert error_deg(estimate_normals(part, make_estimator("iw12"))) < limit_deg
+    truth, lamps = window.of(capture.ground_truth), capture.lamps.within(left, top, 2, None)
+    part = replace(capture, observations=capture.observations[rows], mask=mask, ground_truth=truth, lamps=lamps)
+    assert error_deg(part) < limit_deg
 
 
 def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +153,7 @@ def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPa
     assert Blocks.over(capture.mask, 900).step == 3
     reduced = find_surface(capture).lamps
     assert np.abs(reduced.points - whole.points).mean() < 0.01
-    assert error_deg(estimate_normals(capture, make_estimator("iw12"))) < 0.2
+    assert error_deg(capture) < 0.2
 
 
 def test_the_python_door_takes_positions() -> None:

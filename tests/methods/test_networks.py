@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import angle_between_deg
@@ -46,22 +47,18 @@ def test_rotations_of_a_canonical_network() -> None:
         assert max(abs(turn) for turn, _ in several) <= 15
 
 
-def test_four_rotations_of_the_paper_network_make_it_fourfold_symmetric() -> None:
-    # Turning the lights by 90 degrees only changes the order of the four rotations.
+PAPER = {"size": "paper", "map_size": 8}
+QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(("settings", "turn", "symmetric_from"), [(PAPER, QUARTER, 4), ({}, np.diag((1.0, -1, 1)), 2)])
+def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from) -> None:
+    """Four make the paper's fourfold symmetric, for turned lights only change their order; two make ours a mirror."""
     observations, lights = pixels(4)
-    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    for rotations, symmetric in ((4, True), (1, False)):
-        network = estimator(random_network(size="paper", map_size=8), rotations=rotations)
-        here, there = (network.estimate(observations, lights), network.estimate(observations, lights @ quarter.T))
-        assert np.allclose(there, here @ quarter.T, atol=1e-4) == symmetric
-
-
-def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None:
-    observations, lights = pixels(10)
-    for rotations, symmetric in ((2, True), (1, False)):
-        network = estimator(rotations=rotations)
-        here, there = (network.estimate(observations, lights), network.estimate(observations, lights * (1, -1, 1)))
-        assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
+    for rotations in (symmetric_from, 1):
+        network = estimator(random_network(**settings), rotations=rotations)
+        here, there = network.estimate(observations, lights), network.estimate(observations, lights @ turn.T)
+        assert np.allclose(there, here @ turn.T, atol=1e-4) == (rotations > 1)
 
 
 def test_progress_changes_no_bit() -> None:

@@ -13,7 +13,7 @@ from splinecli.capture import Capture, read_capture
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import scored_rows
 from splinecli.inference import estimate_normals
-from splinecli.light.lamp_light import LampLight
+from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import unit
 from splinecli.methods.estimator import UNKNOWN_ERROR
 from splinecli.methods.networks import NetworkEstimator
@@ -38,6 +38,10 @@ def lively(network: Network) -> Network:
     return network.eval()
 
 
+def distant(observations: NDArray[np.float32], lights: NDArray[np.float64] = LIGHTS) -> LightOf:
+    return lambda rows: LampLight(observations[rows], lights)
+
+
 def refine(
     mask: NDArray[np.bool_], tile: int, *, dark: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -49,12 +53,9 @@ def refine(
     observations = (normals @ LIGHTS.T).clip(0).astype(np.float32)
     if dark is not None:
         observations[dark], errors[dark] = 0, UNKNOWN_ERROR
-    net = lively(RefineNet())
-    refined = normals.copy()
-    done: list[int] = []
-    NetworkRefiner(net, "float32", tile=tile, margin=REACH).refine(
-        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), refined, errors, progress=done.append
-    )
+    refined, done = normals.copy(), []
+    refiner = NetworkRefiner(lively(RefineNet()), "float32", tile=tile, margin=REACH)
+    refiner.refine(mask, observations, distant(observations), refined, errors, progress=done.append)
     assert sum(done) == count
     return normals, refined, errors
 
@@ -99,9 +100,7 @@ def test_a_turned_capture_gets_turned_normals() -> None:
         found = (np.rot90(normals, turns)[seen] @ turn.T).astype(np.float32)
         observations = (found @ lights.T).clip(0).astype(np.float32)
         errors = np.tile(np.float32((-3, 1)), (len(found), 1))
-        NetworkRefiner(net, "float32").refine(
-            seen, observations, lambda rows: LampLight(observations[rows], lights), found, errors
-        )
+        NetworkRefiner(net, "float32").refine(seen, observations, distant(observations, lights), found, errors)
         result = np.zeros((*seen.shape, 3), np.float32)
         result[seen] = found @ turn
         return np.rot90(result, -turns)

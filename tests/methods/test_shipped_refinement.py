@@ -142,15 +142,13 @@ def test_seams_of_tiles_do_not_show() -> None:
     errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
     whole = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32")))
     found = []
+
+    def light_of(chosen: Any) -> LampLight:
+        return LampLight(capture.observations[chosen], LIGHTS)
+
     for refiner in (whole, NetworkRefiner(whole.network, "float32", tile=MARGIN)):
         normals, errors = before.copy(), errors_before.copy()
-        refiner.refine(
-            capture.mask,
-            capture.observations,
-            lambda chosen: LampLight(capture.observations[chosen], LIGHTS),
-            normals,
-            errors,
-        )
+        refiner.refine(capture.mask, capture.observations, light_of, normals, errors)
         found.append((normals, errors))
     assert angle_between_deg(found[0][0], before).mean() > 0.2
     assert angle_between_deg(found[0][0], found[1][0]).max() < 0.006  # 1e-4 radians

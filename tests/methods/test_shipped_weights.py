@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scenes import shade
+from scenes import directions_at, shade
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import CONFIDENT_DEG
@@ -24,9 +24,8 @@ def glossy_pixels(n_lights: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     grid = np.linspace(-0.7, 0.7, 5)
     x, y = (axis.ravel() for axis in np.meshgrid(grid * 0.9, grid * 0.9))
     normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
-    step = (np.arange(n_lights) + 0.5) / n_lights
-    azimuth, radius = 2.4 * np.arange(n_lights), 0.8 * np.sqrt(step)
-    lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
+    radius = 0.8 * np.sqrt((np.arange(n_lights) + 0.5) / n_lights)
+    lights = directions_at(2.4 * np.arange(n_lights), np.arcsin(radius))
     return normals, lights, (0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)).astype(np.float32)
 
 
@@ -42,10 +41,8 @@ def test_file(name):
 @pytest.mark.parametrize("n_lights", [8, 96])
 def test_glossy_pixels_are_better_than_by_least_squares(n_lights):
     normals, lights, observations = glossy_pixels(n_lights)
-    ours, plain = (
-        make_estimator(name, MethodOptions(precision="float32")).estimate(observations, lights)
-        for name in ("spline-net", "ls")
-    )
+    estimators = [make_estimator(name, MethodOptions(precision="float32")) for name in ("spline-net", "ls")]
+    ours, plain = (estimator.estimate(observations, lights) for estimator in estimators)
     assert angle_between_deg(ours, normals).mean() < angle_between_deg(plain, normals).mean()
 
 

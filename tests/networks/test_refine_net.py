@@ -85,9 +85,8 @@ def test_outside_of_the_mask_is_outside_of_the_image() -> None:
     wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
     net = random_net().double()
     box = (..., slice(2 * COARSEST, 2 * COARSEST + 20), slice(COARSEST, COARSEST + 24))
-    for alone, within in zip(
-        net(features.double(), mask.double()), net(wide.double(), wide_mask.double()), strict=True
-    ):
+    found = net(features.double(), mask.double()), net(wide.double(), wide_mask.double())
+    for alone, within in zip(*found, strict=True):
         torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 

@@ -27,12 +27,8 @@ def saved(tmp_path: Path) -> Path:
 
 
 def write_like_splinecli(path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str) -> None:
-    metadata = {
-        "format": FORMAT,
-        "config": json.dumps(network.config.to_dict()),
-        "tensors_sha256": tensors_sha256(tensors),
-    }
-    save_file(tensors, path, metadata | changes)
+    metadata = {"format": FORMAT, "config": json.dumps(network.config.to_dict())}
+    save_file(tensors, path, metadata | {"tensors_sha256": tensors_sha256(tensors)} | changes)
 
 
 @pytest.mark.parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
@@ -122,13 +118,11 @@ def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
     load_weights(saved)
 
 
-@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64])
-def test_files_of_other_kinds(saved: Path, content: bytes) -> None:
-    whole = saved.read_bytes()
-    for other in (content, whole[:-100]):
-        saved.write_bytes(other)
-        with pytest.raises(ModelError, match="not a safetensors file"):
-            load_weights(saved)
+@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64, None])
+def test_files_of_other_kinds(saved: Path, content: bytes | None) -> None:
+    saved.write_bytes(saved.read_bytes()[:-100] if content is None else content)
+    with pytest.raises(ModelError, match="not a safetensors file"):
+        load_weights(saved)
 
 
 def test_somebody_else_s_safetensors(tmp_path: Path) -> None:
@@ -145,16 +139,11 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
             return Path.touch, (tmp_path / "exploded",)
 
     path = tmp_path / "weights.pth"
-    path.write_bytes(pickle.dumps(Bomb()))
-    with pytest.raises(ModelError, match="not a safetensors file"):
-        resolve_weights(str(path))
-    torch.save({"weight": torch.zeros(3)}, path)
-    with pytest.raises(ModelError, match="not a safetensors file"):
-        resolve_weights(str(path))
+    for write in (lambda: path.write_bytes(pickle.dumps(Bomb())), lambda: torch.save({"w": torch.zeros(3)}, path)):
+        write()
+        with pytest.raises(ModelError, match="not a safetensors file"):
+            resolve_weights(str(path))
     assert not (tmp_path / "exploded").exists()
-
-
-def test_a_folder_in_place_of_weights(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="is a folder"):
         resolve_weights(str(tmp_path))
 
@@ -181,9 +170,8 @@ def test_weights_that_are_not_finite(tmp_path: Path) -> None:
 
 
 def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
-    header = json.dumps(
-        {str(number): {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for number in range(30_000)}
-    ).encode()
+    empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
+    header = json.dumps({str(number): empty for number in range(30_000)}).encode()
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"):
         load_weights(tmp_path / "a.safetensors")

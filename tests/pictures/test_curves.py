@@ -9,15 +9,10 @@ from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.training_curves import training_figure
 
 COLUMNS: dict[str, list[float | None]] = {
-    "step": [50, 100, 125],
-    "loss": [2.0, 1.0, 0.5],
-    "symmetric": [None, 0.5, None],
-    "asymmetric": [None, None, None],
-    "angle_deg": [20.0, 10.0, 8.0],
-    "validation_deg": [None, 12.5, 9.0],
-    "map_error": [0.2, 0.1, 0.08],
-    "masked_map_error": [0.1, 0.05, 0.04],
-}
+    "step": [50, 100, 125], "loss": [2.0, 1.0, 0.5], "symmetric": [None, 0.5, None], "asymmetric": [None] * 3,
+    "angle_deg": [20.0, 10.0, 8.0], "validation_deg": [None, 12.5, 9.0],
+    "map_error": [0.2, 0.1, 0.08], "masked_map_error": [0.1, 0.05, 0.04],
+}  # fmt: skip
 
 
 def lines(axes: Any) -> dict[str, list[list[float]]]:
@@ -35,9 +30,9 @@ def test_each_curve_leaves_out_what_was_not_computed() -> None:
     assert loss.get_yscale() == "linear"
 
 
-def test_wide_curves_are_logarithmic_unless_a_value_is_zero() -> None:
-    assert training_figure(COLUMNS | {"loss": [50.0, 1.0, 0.5]}).axes[0].get_yscale() == "log"
-    assert training_figure(COLUMNS | {"loss": [50.0, 0.0, 0.5]}).axes[0].get_yscale() == "linear"
+@pytest.mark.parametrize(("middle", "scale"), [(1.0, "log"), (0.0, "linear")])
+def test_wide_curves_are_logarithmic_unless_a_value_is_zero(middle: float, scale: str) -> None:
+    assert training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
 
 
 def test_without_a_li_net_the_map_errors_are_hidden() -> None:

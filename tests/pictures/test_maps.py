@@ -68,8 +68,7 @@ def test_a_small_map_is_enlarged_pixel_by_pixel() -> None:
     errors = np.full((60, 50), np.nan, np.float32)
     errors[10:20, 30:40] = 30
     picture = error_map_picture(errors)
-    assert picture.dtype == np.uint8
-    assert picture.shape[0] == 300
+    assert picture.dtype == np.uint8 and picture.shape[0] == 300
     square = np.zeros((300, 250), bool)
     square[50:100, 150:200] = True
     np.testing.assert_array_equal((picture[:, :250] != 255).any(axis=2), square)

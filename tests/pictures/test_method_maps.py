@@ -22,9 +22,8 @@ def draw(
     estimate = np.full_like(truth, np.nan)
     estimate[mask] = unit(np.array([1.0, 0.0, 1.0]))
     errors = np.where(mask, np.float32(error_deg), np.float32(np.nan))
-    return decode_rgb(
-        method_maps(truth, mask, dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors), title=title)
-    )
+    estimates, error_maps = dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors)
+    return decode_rgb(method_maps(truth, mask, estimates, error_maps, title=title))
 
 
 def places_of(colour: tuple[int, ...], picture: NDArray[np.uint8]) -> list[tuple[int, int, int, int]]:

@@ -46,9 +46,13 @@ def client(cluster: Any) -> Iterator[Any]:
         yield client
 
 
-@pytest.fixture
-def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]:
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Callable[..., Work]:
     (tmp_path / "probe").touch()
 
     def make(do: Callable[..., Any]) -> Work:
@@ -147,7 +151,6 @@ def results_in(folder: str) -> dict[str, bytes]:
 
 
 def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
     names = [*write_captures(["b", "broken", "a", "c", "d"]), "missing"]
     call = ["infer", *names, "--maps", "albedo", "--method", "ls"]
 
@@ -183,7 +186,6 @@ def test_the_cores_are_shared_out(monkeypatch, work):
 
 
 def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
     call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls"]
     assert main([*call, "-o", "out", "-q"]) == 0
     expected = results_in("out")
@@ -195,7 +197,6 @@ def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
 
 
 def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     folders = [Path(name) for name in write_captures(["a"])]
     weights = SimpleNamespace(weights={"sha256": "1234"})
     monkeypatch.setattr(batch, "make_method", lambda options: weights)
@@ -206,7 +207,6 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
 
 
 def test_an_output_that_cannot_be_written_ends_the_batch(cluster, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     folders = [Path(name) for name in write_captures(["a", "b"])]
     Path("out").mkdir()
     Path("out/a").write_text("a file")
@@ -219,19 +219,14 @@ def test_an_output_that_cannot_be_written_ends_the_batch(cluster, tmp_path, monk
     "address", ["tcp://127.0.0.1:1", "strange://x", "http://x", "none.json", "broken.json", "tcp://"]
 )
 def test_no_scheduler(address, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     Path("broken.json").write_text("{}")
     monkeypatch.setattr(connection, "_CONNECT_SECONDS", 0.2)
-    with (
-        pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"),
-        connection.connected(ClusterOptions(address=address)),
-    ):
-        pass
+    with pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"):
+        connection.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
-    monkeypatch.chdir(tmp_path)
     member = Member(tmp_path / "unseen", "unseen")
     outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
@@ -242,15 +237,11 @@ def test_a_server_that_is_no_scheduler(monkeypatch):
     monkeypatch.setattr(connection, "_ANSWER_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with (
-            pytest.raises(UsageError, match="no Dask scheduler answers"),
-            connection.connected(ClusterOptions(address=address)),
-        ):
-            pass
+        with pytest.raises(UsageError, match="no Dask scheduler answers"):
+            connection.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
     names = write_captures(["data/b", "data/damaged", "data/a", "data/without"])
     for name in names[:3]:
         np.save(f"{name}/normals_gt.npy", np.float32(np.broadcast_to([0, 0, 1], (12, 15, 3))))
@@ -281,7 +272,6 @@ def test_errors_travel(client):
 
 def test_the_number_of_workers(tmp_path, monkeypatch):
     """Captures of 12 x 15 pixels take little; the machine of the test has four cores and memory for three."""
-    monkeypatch.chdir(tmp_path)
     members = list_captures([Path(name) for name in write_captures(["a", "broken", "c", "d", "e"])])
     options = InferOptions(method="ls")
     assert 0 < expected_bytes(members[0], options) < 10**6

@@ -67,9 +67,7 @@ def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("learning", "faster"), [(0.1, True), (1e9, False)])
-def test_large_captures_are_distilled_where_that_is_faster(
-    monkeypatch: pytest.MonkeyPatch, learning: float, faster: bool
-) -> None:
+def test_large_captures_are_distilled_where_that_is_faster(monkeypatch, learning, faster):
     """The teacher takes at least 20 microseconds a pixel, so 2 seconds for all and 0.002 for the sample."""
     monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: learning)
     monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
@@ -84,8 +82,7 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
     teacher = Teacher(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None
-    assert warning.code == "not_distilled"
-    assert "where it expects errors of 2.9 degrees" in warning.text
+    assert warning.code == "not_distilled" and "where it expects errors of 2.9 degrees" in warning.text
     assert teacher.asked == 500 + 900  # both sizes were tried
 
 

@@ -1,5 +1,5 @@
 """Fixtures of small pixel sets."""
 
-from small_pixel_sets import _matte_pixels, make_set
+from small_pixel_sets import make_set
 
-__all__ = ["_matte_pixels", "make_set"]
+__all__ = ["make_set"]

@@ -1,6 +1,5 @@
 """Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only gaps."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import torch
 
 from distributions import generator as seeded
+from small_pixel_sets import MakeSet
 from splinecli.maths.observation_map import cell_directions
 from splinecli.pixel_sets.source import FILL_ROUNDS, PixelSetSource, SampledPixels, fill_gaps
 from splinecli.pixel_sets.store import PixelSet
@@ -17,7 +17,6 @@ FAULTLESS = CaptureConfig(
     min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
     light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
 )  # fmt: skip
-MakeSet = Callable[..., PixelSet]
 
 
 def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:
@@ -30,12 +29,9 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
     batch = source_of(pixel_set).draw(200)
     stored = {entry.name: pixel_set.load(entry) for entry in pixel_set.entries}
     seen = set()
+    rows = {normal.tobytes(): (name, row) for name in stored for row, normal in enumerate(stored[name].normals)}
     for pixel, normal in enumerate(batch.truth.normals.numpy()):
-        name, row = next(
-            (name, int(np.flatnonzero((pixels.normals == normal).all(axis=1))[0]))
-            for name, pixels in stored.items()
-            if (pixels.normals == normal).all(axis=1).any()
-        )
+        name, row = rows[normal.tobytes()]
         seen.add(name)
         valid = batch.valid[pixel].numpy()
         used = set()

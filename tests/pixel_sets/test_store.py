@@ -11,23 +11,22 @@ import numpy as np
 import pytest
 
 from kills import content, killed_at
+from small_pixel_sets import MakeSet, matte_pixels
 from splinecli.errors import InputError, OutputError
 from splinecli.pictures.contact_sheet import contact_sheet
-from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, open_pixel_set
+from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, open_pixel_set
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.publishing import held_folder
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
-MakeSet = Callable[..., PixelSet]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text())
-    return manifest
+    return json.loads((folder / MANIFEST).read_text())
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: type) -> None:
+def test_round_trip(tmp_path: Path, dtype: type) -> None:
     folder = tmp_path / "new" / "set"
     writer = PixelSetWriter(folder)
     written = {name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")}
@@ -44,8 +43,7 @@ def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: typ
         loaded = opened.load(entry)
         for array in ARRAYS:
             found, expected = getattr(loaded, array), getattr(written[entry.name], array)
-            assert found.dtype == expected.dtype
-            assert isinstance(found.base, np.memmap)
+            assert found.dtype == expected.dtype and isinstance(found.base, np.memmap)
             np.testing.assert_array_equal(found, expected)
     assert opened.load(opened.entries[0]).observations.dtype == dtype
     manifest = read_manifest(folder)
@@ -55,9 +53,7 @@ def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: typ
     assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
 
 
-def test_an_entry_that_cannot_be_written_leaves_nothing(
-    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_entry_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
     writer = PixelSetWriter(tmp_path)
     writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = content(tmp_path)
@@ -85,7 +81,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
     assert [entry.name for entry in open_pixel_set(tmp_path).entries] == ["a", "b"]
 
 
-def test_continuing_keeps_existing_entries(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+def test_continuing_keeps_existing_entries(tmp_path: Path) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
     again = PixelSetWriter(tmp_path)
@@ -102,7 +98,7 @@ def test_continuing_keeps_existing_entries(tmp_path: Path, matte_pixels: Callabl
     assert len(more.finish().entries) == 3
 
 
-def test_recipes_are_compared(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+def test_recipes_are_compared(tmp_path: Path) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     writer = PixelSetWriter(tmp_path)
     assert writer.difference("a", dict(reversed(RECIPE.items()))) is None
@@ -110,9 +106,7 @@ def test_recipes_are_compared(tmp_path: Path, matte_pixels: Callable[..., Any]) 
     assert writer.difference("a", {"seed": 1}) == "scenes = {'lights': 30}, not None"
 
 
-def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(
-    tmp_path: Path, matte_pixels: Callable[..., Any]
-) -> None:
+def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(tmp_path):
     old, new, kept, step = matte_pixels(7, 5), matte_pixels(9, 4), [], 0
     while True:
         folder = tmp_path / str(step)
@@ -190,9 +184,8 @@ def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: st
     path.write_bytes(whole)
     open_pixel_set(folder)
     path.unlink()
-    with pytest.raises(InputError, match="found no plain file") as caught:
+    with pytest.raises(InputError, match=f"{entry}/{array}.npy: .*found no plain file"):
         open_pixel_set(folder)
-    assert caught.value.path == path
 
 
 DAMAGED: dict[str, Callable[[Path], object]] = {

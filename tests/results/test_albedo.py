@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import write_capture
+from scenes import square_grid, write_capture
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.gray import measure_light_intensities
 from splinecli.capture import open_capture
@@ -15,40 +15,38 @@ from splinecli.results.albedo import albedo_map
 SIZE = 40
 INTENSITIES = np.array([(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)])
 LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)])
+LIGHTS = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
 
 
 @pytest.fixture
 def scene(tmp_path: Path):
     """Folder, true normals and true albedo of a capture; some pixels have a highlight or a shadow under one light."""
-    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
-    y, x = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
-    nx, ny = x / (SIZE / 2), -y / (SIZE / 2)
-    inside = np.hypot(nx, ny) < 0.9
-    nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 1))
-    normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0).astype(np.float32)
+    x, y = square_grid(SIZE, 1 - 1 / SIZE)
+    inside = np.hypot(x, y) < 0.9
+    z = np.sqrt(np.where(inside, 1 - x**2 - y**2, 1))
+    normals = np.where(inside[..., None], np.stack((x, y, z), axis=-1), 0).astype(np.float32)
     rng = np.random.default_rng(0)
     albedo = np.where(inside[..., None], rng.uniform(0.1, 0.6, (SIZE, SIZE, 3)), 0)
-    images = albedo * (normals @ lights.T).clip(0).transpose(2, 0, 1)[..., None]
+    images = albedo * (normals @ LIGHTS.T).clip(0).transpose(2, 0, 1)[..., None]
     for number, image in enumerate(images):
         image[number::12] *= 0.1  # cast shadow on every twelfth row
         image[:, number::12] += 0.2  # highlights on every twelfth column
     stored = np.rint((images * INTENSITIES[:, None, None]).clip(0, 1) * 65535).astype(np.uint16)
-    write_capture(tmp_path, stored, lights, mask=inside, intensities=INTENSITIES, names="{}.png")
+    write_capture(tmp_path, stored, LIGHTS, mask=inside, intensities=INTENSITIES, names="{}.png")
     return tmp_path, normals, albedo
 
 
 def test_a_gray_target_balances_the_colours(scene, tmp_path):
     """With the intensities that calibrate measures on a gray card under coloured lamps, what is gray looks gray."""
     folder, normals, _ = scene
-    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
     (tmp_path / "card").mkdir()
     tint = INTENSITIES * (1, 0.7, 0.4)
-    for number, (light, colour) in enumerate(zip(lights, tint, strict=True)):
+    for number, (light, colour) in enumerate(zip(LIGHTS, tint, strict=True)):
         card = np.broadcast_to(0.5 * light[2] * colour * 65535, (20, 20, 3))
         cv2.imwrite(str(tmp_path / f"card/{number}.png"), np.rint(card[..., ::-1]).astype(np.uint16))
         gray = 0.4 * (normals @ light).clip(0)[..., None] * colour * 65535
         cv2.imwrite(str(folder / f"{number}.png"), np.rint(gray[..., ::-1]).astype(np.uint16))
-    measured = measure_light_intensities(find_ball_files(tmp_path / "card"), lights, "card")
+    measured = measure_light_intensities(find_ball_files(tmp_path / "card"), LIGHTS, "card")
     np.savetxt(folder / "light_intensities.txt", measured)
     source = open_capture(folder)
     found = albedo_map(source, source.read(), normals)[normals.any(axis=2)]

@@ -52,43 +52,24 @@ class Page(HtmlPage):
 def test_it_stands_alone() -> None:
     normals, mask = ball(40)
     html = result_page(REPORT, normals, mask, albedo=normals + 1, error_map_deg=normals[..., 0] * 40)
-    page = Page(html)
-    assert not re.search(
-        r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\(""", html
-    )
-    policy = next(a["content"] for tag, a in page.tags if tag == "meta" and "http-equiv" in a)
+    outside = r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\("""
+    assert not re.search(outside, html)
+    policy = next(a["content"] for tag, a in Page(html).tags if tag == "meta" and "http-equiv" in a)
     assert policy.startswith("default-src 'none'; img-src data:;")
 
 
 def test_figures_and_pictures() -> None:
     normals, mask = ball(40)
     errors = np.where(mask, 90 * normals[..., 2], np.nan).astype(np.float32)
-    page = Page(
-        result_page(
-            {**REPORT, "warnings": [{"code": "eight_bit", "text": "The images are 8-bit."}]},
-            normals,
-            mask,
-            albedo=np.full_like(normals, 0.3) * mask[..., None],
-            confidence_map=mask.astype(np.float32) * 0.6,
-            error_map_deg=errors,
-        )
-    )
+    report = {**REPORT, "warnings": [{"code": "eight_bit", "text": "The images are 8-bit."}]}
+    maps = {"albedo": np.full_like(normals, 0.3) * mask[..., None], "confidence_map": mask.astype(np.float32) * 0.6}
+    page = Page(result_page(report, normals, mask, **maps, error_map_deg=errors))
     assert page.text["h1"] == page.text["title"] == ["Photometric stereo: ball"]
     assert page.facts == {
-        "Mean": "9.06°",
-        "Median": "6.24°",
-        "90th percentile": "18.10°",
-        "Under 5°": "37.2%",
-        "Under 10°": "75.0%",
-        "Method": "spline-net",
-        "Weights": "blobby-7",
-        "Lights": "10",
-        "Pixels": "45,200",
-        "Size": "296 × 321",
-        "Likely within 5°": "81% of the pixels",
-        "Seconds": "read 0.6, estimate 0.008",
-        "Device": "cpu, float32",
-    }
+        "Mean": "9.06°", "Median": "6.24°", "90th percentile": "18.10°", "Under 5°": "37.2%", "Under 10°": "75.0%",
+        "Method": "spline-net", "Weights": "blobby-7", "Lights": "10", "Pixels": "45,200", "Size": "296 × 321",
+        "Likely within 5°": "81% of the pixels", "Seconds": "read 0.6, estimate 0.008", "Device": "cpu, float32",
+    }  # fmt: skip
     assert page.text["li"] == ["The images are 8-bit."]
     assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]
     assert (page.picture("Albedo map")[20, 20] == 255).all()  # the brightest hundredth is white
@@ -99,14 +80,9 @@ def test_figures_and_pictures() -> None:
 
 def test_names_are_text() -> None:
     normals, mask = ball(40)
-    hostile = {"capture": HOSTILE, "method": HOSTILE, "device": HOSTILE, "version": HOSTILE}
-    report = {
-        **REPORT,
-        **hostile,
-        "weights": {"name": HOSTILE, "sha256": ""},
-        "warnings": [{"code": "", "text": HOSTILE}],
-    }
-    page = Page(result_page(report, normals, mask))
+    hostile = dict.fromkeys(("capture", "method", "device", "version"), HOSTILE)
+    hostile |= {"weights": {"name": HOSTILE, "sha256": ""}, "warnings": [{"code": "", "text": HOSTILE}]}
+    page = Page(result_page({**REPORT, **hostile}, normals, mask))
     plain = Page(result_page({**REPORT, "warnings": [{"code": "", "text": "w"}]}, normals, mask))
     assert [tag for tag, _ in page.tags] == [tag for tag, _ in plain.tags]
     assert page.text["script"] == plain.text["script"]

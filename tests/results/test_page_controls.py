@@ -24,9 +24,8 @@ def lights_are(page: Any, x: float, y: float, note: str) -> None:
 def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
-    errors = np.where(mask, np.float32(3), np.nan)
-    confidence = mask.astype(np.float32)
-    html = result_page(report, normals, mask, albedo=normals + 1, confidence_map=confidence, error_map_deg=errors)
+    maps = {"confidence_map": mask.astype(np.float32), "error_map_deg": np.where(mask, np.float32(3), np.nan)}
+    html = result_page(report, normals, mask, albedo=normals + 1, **maps)
     page = open_page(html, width=400, height=800, webgl=webgl)
     page.evaluate("splinecli.ready")
     canvas = page.locator("#view")
@@ -116,9 +115,7 @@ def test_fingers(open_page: OpenPage) -> None:
 
 
 @pytest.mark.parametrize("millimetres", [None, 0.25])
-def test_the_ruler_has_the_unit_of_the_surface(
-    open_page: OpenPage, monkeypatch: pytest.MonkeyPatch, millimetres: float | None
-) -> None:
+def test_the_ruler_has_the_unit_of_the_surface(open_page, monkeypatch, millimetres):
     """A line over half the width of a reduced map is 128 pixels of the whole map, also where the view is zoomed."""
     monkeypatch.setattr(page_module, "LARGEST_MAP", (SIDE // 2) ** 2)
     report = {**REPORT, "surface": {"pixel_size_mm": millimetres}}

@@ -1,18 +1,17 @@
 """Integration of normals, against analytic surfaces and a dense solver."""
 
 import re
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
-from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
 from splinecli.surface.bilateral_equations import CONTRADICTION
-from splinecli.surface.integration import integrate_normals
+from splinecli.surface.integration import integrate_normals, relief_of_normals
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,13 +50,15 @@ def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats
     return np.stack((x, y, z), axis=-1) / radius * mask[..., None], mask, z
 
 
-def bumps(height: int, width: int, seed: int = 0) -> Floats:
-    """Return normals that no surface has: smooth ones with noise, some nearly grazing, some facing away."""
+def bumps(height: int, width: int, seed: int = 0, *, usable: bool = False) -> Floats:
+    """Return normals that no surface has: smooth with noise, some nearly grazing, some facing away unless `usable`."""
     rng = np.random.default_rng(seed)
     x, y = grid(height, width)
     normals = normals_of_slopes(np.sin(x / 3) + y / height, np.cos(y / 2))
     normals = unit(normals + rng.normal(scale=0.2, size=normals.shape))
     normals[rng.uniform(size=(height, width)) < 0.03] = unit(np.array([0.6, 0.2, -0.3]))
+    if usable:
+        normals[normals[..., 2] < 0.1] = (0, 0, 1)
     return normals
 
 
@@ -137,11 +138,10 @@ def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> 
     x, y = grid(*shape)
     mask = np.ones(shape, bool)
     normals = normals_of_slopes(slopes[0] + 0 * x, slopes[1] + 0 * x)
-    found = integrate_normals(normals.astype(np.float32), mask)
     # As float32 slopes of s have errors of s^2 * 1e-7, over 90 pixels.
-    np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=3e-3, rtol=0)
-    found = integrate_normals(normals, mask)
-    np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=1e-4, rtol=0)
+    for dtype, atol in ((np.float32, 3e-3), (np.float64, 1e-4)):
+        found = integrate_normals(normals.astype(dtype), mask)
+        np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
 
 
 def seen(camera: Floats, height: int, width: int) -> Floats:
@@ -153,14 +153,17 @@ def seen(camera: Floats, height: int, width: int) -> Floats:
 
 @pytest.mark.usefixtures("any_scale")
 def test_perspective_plane() -> None:
-    rays = seen(CAMERA, 90, 120)
+    rays, mask = seen(CAMERA, 90, 120), np.ones((90, 120), bool)
     normal = unit(np.array([0.3, -0.4, 0.8]))
     depth = -1 / (rays @ normal)
     depth /= np.exp(np.log(depth).mean())
-    found = integrate_normals(np.broadcast_to(normal, rays.shape), np.ones((90, 120), bool), camera_matrix=CAMERA)
+    normals = np.broadcast_to(normal, rays.shape)
+    found = integrate_normals(normals, mask, camera_matrix=CAMERA)
     # A step of log(depth) is not quite linear in its slope.
-    assert error_share(found, depth, np.ones((90, 120), bool)) < 5e-4
+    assert error_share(found, depth, mask) < 5e-4
     np.testing.assert_allclose(found, depth, rtol=1e-3)
+    # A prior gives depths their scale.
+    np.testing.assert_allclose(integrate_normals(normals, mask, CAMERA, prior=500 * depth), 500 * depth, rtol=1e-3)
 
 
 @pytest.mark.usefixtures("any_scale")
@@ -228,15 +231,13 @@ def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Flo
 
 
 def test_least_squares_is_the_dense_solution() -> None:
-    normals, mask = bumps(14, 19), holes(14, 19)
-    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     found = integrate_normals(normals, mask, stiffness=0)[mask]
     np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
 
 
 def test_a_prior_is_the_dense_solution() -> None:
-    normals, mask = bumps(14, 19), holes(14, 19)
-    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     prior = np.random.default_rng(2).normal(size=mask.shape)
     prior[:, 12:] = np.nan  # parts there have mean height 0, in relation to the mean of the prior
     found = integrate_normals(normals, mask, stiffness=0, prior=prior, prior_detail=8)[mask]
@@ -280,16 +281,6 @@ def test_a_prior_is_better_than_normals_and_scan_alone(stiffness: float) -> None
     assert abs(np.mean(both - heights)) < 0.1
 
 
-def test_a_prior_gives_depths_their_scale() -> None:
-    mask = np.ones((84, 126), bool)
-    rays = seen(CAMERA, *mask.shape)
-    normal = unit(np.array([0.2, -0.3, 1.0]))
-    truth = 1 / np.abs(rays @ normal)
-    prior = 500 * truth / truth.mean()
-    found = integrate_normals(np.broadcast_to(normal, (*mask.shape, 3)), mask, CAMERA, prior=prior)
-    np.testing.assert_allclose(found, prior, rtol=1e-3)
-
-
 @pytest.mark.parametrize("factor", [-1.0, 20.0, 0.01])
 def test_a_prior_in_another_direction_or_unit(factor: float) -> None:
     normals, heights, _ = drifting()
@@ -301,8 +292,7 @@ def test_a_prior_in_another_direction_or_unit(factor: float) -> None:
 
 @pytest.mark.usefixtures("until_nothing_moves")
 def test_bilateral_is_the_dense_solution() -> None:
-    normals, mask = bumps(12, 17), holes(12, 17)
-    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    normals, mask = bumps(12, 17, usable=True), holes(12, 17)
     found = integrate_normals(normals, mask)[mask]
     least_squares = dense(normals, mask, 0, 1)
     expected = dense(normals, mask, 2, 200)
@@ -347,8 +337,7 @@ def test_inputs_do_not_change_and_progress_is_reported() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     kept, calls = normals.copy(), []
     integrate_normals(normals, mask, stiffness=0, progress=calls.append)
-    np.testing.assert_array_equal(normals, kept)
-    assert calls == [1.0]
+    assert np.array_equal(normals, kept) and calls == [1.0]
 
 
 @pytest.mark.parametrize("background", [0.0, np.nan])
@@ -382,9 +371,7 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected"),
     ],
 )
-def test_bad_input(
-    arguments: tuple[Any, ...], options: dict[str, Any], error: type[SplinecliError], message: str
-) -> None:
+def test_bad_input(arguments, options, error, message):
     with pytest.raises(error, match=re.escape(message)):
         integrate_normals(*arguments, **options)
 
@@ -401,3 +388,13 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> No
         found = integrate_normals(noisy, np.ones(x.shape, bool), stiffness=stiffness)
         torn[stiffness] = float((np.abs(np.diff(found - truth, axis=1)) > 1.5).mean())
     assert torn[0] < torn[2] < 0.0125
+
+
+@pytest.mark.parametrize(("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))])
+def test_of_a_wave_the_stated_share_is_kept(wave: int, kept: float) -> None:
+    x = np.broadcast_to(np.arange(512), (96, 512))
+    k = 2 * np.pi / wave
+    normals = normals_of_slopes(-0.5 * k * np.sin(k * x), 0.0 * x).astype(np.float32)
+    relief = relief_of_normals(normals, np.ones(x.shape, bool))
+    middle = (slice(None), slice(128, 384))
+    np.testing.assert_allclose(relief[middle], 0.5 * kept * np.cos(k * x)[middle], atol=0.01)

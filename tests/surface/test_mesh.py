@@ -10,18 +10,11 @@ from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
 
 
-def wave(height: int = 15, width: int = 20) -> NDArray[np.float64]:
-    rows, columns = np.mgrid[:height, :width]
-    return np.asarray(3 * np.sin(columns / 4) + rows / 5)
-
-
-def colourful(height: int = 15, width: int = 20) -> NDArray[np.uint8]:
-    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-
-
-def ragged(height: int = 15, width: int = 20) -> NDArray[np.bool_]:
-    mask: NDArray[np.bool_] = np.random.default_rng(1).uniform(size=(height, width)) < 0.8
-    return mask
+ROWS, COLUMNS = np.mgrid[:15, :20]
+WAVE = 3 * np.sin(COLUMNS / 4) + ROWS / 5
+COLOURS = np.random.default_rng(0).integers(0, 256, (15, 20, 3), np.uint8)
+RAGGED = np.random.default_rng(1).uniform(size=(15, 20)) < 0.8
+RAGGED[3, 4] = True
 
 
 def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
@@ -39,9 +32,9 @@ def test_four_pixels() -> None:
     assert (mesh.vertices.dtype, mesh.triangles.dtype, mesh.colours) == (np.float32, np.int32, None)
 
 
-@pytest.mark.parametrize("mask", [np.ones((15, 20), bool), ragged()], ids=["full", "ragged"])
+@pytest.mark.parametrize("mask", [np.ones((15, 20), bool), RAGGED], ids=["full", "ragged"])
 def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) -> None:
-    mesh = surface_mesh(wave(), mask)
+    mesh = surface_mesh(WAVE, mask)
     assert len(mesh.vertices) == np.count_nonzero(mask)
     # Seen along z, half a pixel each, counter-clockwise.
     np.testing.assert_allclose(face_normals(mesh)[:, 2], 1)
@@ -51,7 +44,7 @@ def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) ->
 
 
 def test_perspective_vertices_project_into_their_pixels() -> None:
-    depth, mask = 50 + wave(), ragged()
+    depth, mask = 50 + WAVE, RAGGED
     mesh = surface_mesh(depth, mask, CAMERA)
     # OpenCV's frame: y down, z forward.
     image = mesh.vertices * (1, -1, -1) @ CAMERA.T
@@ -85,11 +78,10 @@ def test_pixels_without_triangles(mask: NDArray[np.bool_]) -> None:
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
 def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
-    colours, normal_map, mask = colourful(), np.zeros((15, 20, 3)), ragged()
+    colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
     normal_map[..., 2] = 1
     normal_map[3, 4] = (0.6, 0, 0.8)
-    mask[3, 4] = True
-    mesh = surface_mesh(50 + wave(), mask, camera, colours, normal_map=normal_map)
+    mesh = surface_mesh(50 + WAVE, mask, camera, colours, normal_map=normal_map)
     np.testing.assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
     np.testing.assert_array_equal(mesh.colours, colours[mask])
     rows, columns = np.nonzero(mask)
@@ -108,4 +100,4 @@ def test_normals_of_the_triangles() -> None:
 
 def test_a_negative_step_is_refused() -> None:
     with pytest.raises(UsageError, match="the largest step is -1, expected"):
-        surface_mesh(wave(), ragged(), largest_step=-1)
+        surface_mesh(WAVE, RAGGED, largest_step=-1)

@@ -66,16 +66,9 @@ def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
 def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
     """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall, to the camera."""
     one, half = torch.ones(1, 1), math.sqrt(0.5)
-    wall = Wall(
-        azimuth=torch.tensor([[1.0, 0.0, 0.0]]),
-        tan_height=one,
-        tan_half_width=one,
-        softness=one,
-        facing=torch.tensor([[-half, 0.0, half]]),
-        reflectance=one,
-        towards=torch.tensor([[1.0, 0.0, 0.0]]),
-        has_pixel_material=one > 0,
-    )
+    side, facing = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[-half, 0.0, half]])
+    sizes = dict.fromkeys(("tan_height", "tan_half_width", "softness", "reflectance"), one)
+    wall = Wall(azimuth=side, towards=side, facing=facing, has_pixel_material=one > 0, **sizes)
     # A wall at 45 degrees sends light from the zenith to the pixel, which faces camera and wall equally.
     mirrored, elsewhere = [0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]
     facing, away = torch.tensor([[half, 0.0, half]]), torch.tensor([[0.2, 0.0, math.sqrt(0.96)]])
@@ -108,7 +101,6 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
 
 def test_ambient_light() -> None:
     ambient = draw_ambient(N, 0.3, generator())
-    assert ambient.shape == (N, 1)
-    assert (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
+    assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
     assert not draw_ambient(N, 0.0, generator()).any()

@@ -16,6 +16,11 @@ def draw_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
     return draw_light_directions(pixels, lights, random, {kind: 1.0}).double().numpy()
 
 
+def centred_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
+    points = draw_rigs(kind, pixels, lights)[..., :2]
+    return points - points.mean(axis=1, keepdims=True)
+
+
 def test_half_of_the_draws_have_about_the_usual_number() -> None:
     random = torch.Generator().manual_seed(0)
     draws = [draw_light_counts(50, 4, 96, 10, random).numpy() for _ in range(4000)]
@@ -35,15 +40,13 @@ def test_half_of_the_draws_have_about_the_usual_number() -> None:
 
 def test_directions_are_unit_vectors_above_the_horizon() -> None:
     directions = draw_light_directions(2000, 30, torch.Generator().manual_seed(0))
-    assert directions.shape == (2000, 30, 3)
-    assert directions.norm(dim=-1).sub(1).abs().max() < 1e-6
+    assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
     # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
     assert directions[..., 2].min() == pytest.approx(0.0894, abs=1e-3)
 
 
 def test_rigs_are_ellipses_of_the_stated_axes() -> None:
-    directions = draw_rigs("ellipse", 1500, 1000)[..., :2]
-    centred = directions - directions.mean(axis=1, keepdims=True)
+    centred = centred_rigs("ellipse", 1500, 1000)
     # A uniform ellipse has variances of a quarter of its half-axes squared.
     axes = 2 * np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 1000))
     small = axes[:, 1] < math.sin(math.radians(40))  # no rig this small is cut by the rim
@@ -57,8 +60,7 @@ def test_rigs_are_ellipses_of_the_stated_axes() -> None:
 
 
 def test_cones_are_narrow() -> None:
-    points = draw_rigs("cone", 500, 400)[..., :2]
-    centred = points - points.mean(axis=1, keepdims=True)
+    centred = centred_rigs("cone", 500, 400)
     radius_deg = np.degrees(np.arcsin(np.linalg.norm(centred, axis=2).max(axis=1)))
     # The mean of 400 lights is off by some hundredths of the radius.
     assert stats.kstest(radius_deg, stats.uniform(8, 12).cdf).statistic < 0.15
@@ -77,8 +79,7 @@ def test_rings_have_one_elevation() -> None:
 
 
 def test_lines_lie_nearly_in_a_plane() -> None:
-    points = draw_rigs("line", 500, 400)[..., :2]
-    centred = points - points.mean(axis=1, keepdims=True)
+    centred = centred_rigs("line", 500, 400)
     across = np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 400)[:, 0])
     assert stats.kstest(np.degrees(np.arcsin(across)), stats.uniform(1, 9).cdf).statistic < 0.1
 

@@ -1,7 +1,6 @@
 """The pixel generator: scenes that turn as a whole, and batches that a capture could hold."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,10 +30,8 @@ def test_batches_hold_what_a_capture_would() -> None:
     batch = draw(4000)
     pixels, lights = batch.observations.shape
     assert pixels == 4000
-    assert batch.light_directions.shape == (pixels, lights, 3)
-    assert batch.valid.shape == (pixels, lights)
-    assert batch.valid.dtype == torch.bool
-    assert batch.exposure.shape == (pixels, 1)
+    assert (batch.light_directions.shape, batch.exposure.shape) == ((pixels, lights, 3), (pixels, 1))
+    assert (batch.valid.shape, batch.valid.dtype) == ((pixels, lights), torch.bool)
     counts = batch.valid.sum(dim=1)
     assert counts.max() == lights <= 96
     # The numbers of one draw differ by a fifth.
@@ -93,8 +90,7 @@ def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
     scene = draw_scene(500, replace(PixelGeneratorConfig(), ambient_share=1.0), torch.Generator().manual_seed(0))
     dense = scene.dense_truth().values
     _, inside = cell_directions()
-    assert dense.shape == (500, 1, 32, 32)
-    assert torch.isfinite(dense).all()
+    assert dense.shape == (500, 1, 32, 32) and torch.isfinite(dense).all()
     assert (dense[:, 0, inside] > 0).all()
     assert not dense[:, 0, ~inside].any()
     assert scene.dense_truth(16).values.shape == (500, 1, 16, 16)
@@ -112,10 +108,8 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> N
     def dense(config: PixelGeneratorConfig) -> torch.Tensor:
         return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_truth().values
 
-    on: dict[str, Any] = {share: 1.0}
-    without: dict[str, Any] = {share: 0.0}
-    assert (dense(replace(NOTHING, **on)) - dense(NOTHING)).abs().max() > 0.01
-    off = draw_scene(400, replace(PixelGeneratorConfig(), **without), torch.Generator().manual_seed(0))
+    assert (dense(replace(NOTHING, **{share: 1.0})) - dense(NOTHING)).abs().max() > 0.01
+    off = draw_scene(400, replace(PixelGeneratorConfig(), **{share: 0.0}), torch.Generator().manual_seed(0))
     if share == "mixed_share":
         assert off.mixed is None
     elif share == "ambient_share":

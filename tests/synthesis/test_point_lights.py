@@ -58,9 +58,8 @@ def test_a_ridge_throws_the_shadow_of_a_point_of_light() -> None:
     tracer = Tracer(mesh)
     visible = find_visible_surface(tracer, SIZE, 1)
     lamps = np.array([(-2.0, 0.0, 1.0), (-2.0, 0.0, 2.0)])  # the shadow of the second ends at x = 2 / 3
-    radiance = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(len(mesh.faces), np.int64))[
-        "matte"
-    ].numpy()
+    patches = np.zeros(len(mesh.faces), np.int64)
+    radiance = render_point_lights(tracer, visible, lamps, matte(0.7), patches)["matte"].numpy()
     # A low ray to the side passes the wall farther off: only the rows near the lamp's own are asked.
     x, y = visible.samples.position[:, 0], visible.samples.position[:, 1]
     middle = (np.abs(y) < 0.1) & (visible.samples.position[:, 2] < 1e-6)

@@ -132,9 +132,8 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0, 0, 1))
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
-    indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=torch.Generator().manual_seed(0))[
-        "matte"
-    ].numpy()[:, 0]
+    generator = torch.Generator().manual_seed(0)
+    indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)["matte"].numpy()[:, 0]
     again = rho / 2
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
     assert indirect.mean() == pytest.approx(expected, rel=0.02)

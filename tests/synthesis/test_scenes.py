@@ -40,11 +40,9 @@ def test_what_is_rendered() -> None:
     assert rendered.mask.shape == (16, 16)
     assert pixels == 256  # the slopes fill the frame
     assert rendered.normals.shape == (pixels, 3)
-    for name in CLASSES:
-        assert rendered.observations[name].shape == (pixels, 24)
-        assert rendered.observations[name].dtype == np.float32
-        assert np.isfinite(rendered.observations[name]).all()
-        assert (rendered.observations[name] >= 0).all()
+    for observations in (rendered.observations[name] for name in CLASSES):
+        assert (observations.shape, observations.dtype) == ((pixels, 24), np.float32)
+        assert np.isfinite(observations).all() and (observations >= 0).all()
     # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
     direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
     alone = render_scene(draw_scene(0, 2, direct, tent()), direct)
@@ -84,8 +82,7 @@ def test_patches_are_connected_areas_of_about_one_size() -> None:
     )
     mesh = Mesh(vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1)))
     patches = draw_patches(mesh, 20, rng)
-    assert patches.shape == (1800,)
-    assert set(np.unique(patches)) <= set(range(20))
+    assert patches.shape == (1800,) and set(np.unique(patches)) <= set(range(20))
     centres = vertices[faces].mean(axis=1)
     for patch in np.unique(patches):
         here = centres[patches == patch]

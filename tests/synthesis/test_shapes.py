@@ -43,10 +43,8 @@ def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
     below = np.minimum(first, second) - union
     assert below.min() >= -1e-7
     assert below.max() == pytest.approx(0.025, abs=1e-3)  # a quarter of the blend, where both are alike
-    cut = fields.smooth_cut(first, second, 0.1)
-    np.testing.assert_allclose(
-        cut[np.abs(first + second) > 0.1], np.maximum(first, -second)[np.abs(first + second) > 0.1]
-    )
+    cut, apart = fields.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
+    np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
 
 
 def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:

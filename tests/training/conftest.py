@@ -2,26 +2,19 @@
 
 import pytest
 
-from small_pixel_sets import _matte_pixels, make_set
+from small_pixel_sets import make_set
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training import tasks
 from splinecli.training.config import TrainingConfig
-from splinecli.training.run_log import RunLog
 from tiny_networks import TINY
 
-__all__ = ["_matte_pixels", "make_set"]
+__all__ = ["make_set"]
 
 
 @pytest.fixture(autouse=True)
 def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 64)
-
-
-@pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Save without drawing the figures, which takes longer than the run itself."""
-    monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
 
 
 @pytest.fixture

@@ -36,10 +36,7 @@ def test_settings_left_out_have_their_defaults() -> None:
         ({"schedule": "linear"}, "'schedule' is 'linear'; expected 'cosine' or 'stepped'"),
         ({"pixels": {"wall_share": 1.5}}, "'wall_share' is 1.5; expected a number from 0 to 1"),
         ({"pixels": {"cast_shadows": 1}}, "'cast_shadows' is 1; expected true or false"),
-        (
-            {"pixels": {"min_lights": 9, "max_lights": 8}},
-            "min_lights, usual_lights, max_lights are 9, 10, 8; expected them in rising order",
-        ),
+        ({"pixels": {"min_lights": 9, "max_lights": 8}}, "max_lights are 9, 10, 8; expected them in rising order"),
         ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
         ({"sources": {"set": True}}, "the weight of source 'set' is True; expected a number from 0"),

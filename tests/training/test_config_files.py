@@ -23,23 +23,14 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
-    file = write(
-        tmp_path / "a.toml", 'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
-    )
-    paper = preset("paper")
-    expected = replace(
-        paper, batch_size=64, pixels=replace(paper.pixels, wall_share=0.3), network=replace(paper.network, map_size=16)
-    )
-    assert configure(None, file) == expected
-    # A preset that is asked for by name comes before the file's.
-    compact = preset("compact")
-    assert configure("compact", file) == replace(
-        compact,
-        batch_size=64,
-        pixels=replace(compact.pixels, wall_share=0.3),
-        network=replace(compact.network, map_size=16),
-    )
+@pytest.mark.parametrize("asked", [None, "compact"])
+def test_a_toml_file_over_a_preset(tmp_path: Path, asked: str | None) -> None:
+    """A preset that is asked for by name comes before the file's."""
+    text = 'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
+    base = preset(asked or "paper")
+    pixels, network = replace(base.pixels, wall_share=0.3), replace(base.network, map_size=16)
+    expected = replace(base, batch_size=64, pixels=pixels, network=network)
+    assert configure(asked, write(tmp_path / "a.toml", text)) == expected
 
 
 def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
@@ -52,10 +43,7 @@ def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [
-        ("batch_size = 7", "'batch_size' is 7; expected a multiple of shards = 2"),
-        ("steps = ", "is not TOML"),
-    ],
+    [("batch_size = 7", "is 7; expected a multiple of shards = 2"), ("steps = ", "is not TOML")],
 )
 def test_what_is_wrong_in_a_file_names_the_file(tmp_path: Path, text: str, message: str) -> None:
     file = write(tmp_path / "a.toml", text)

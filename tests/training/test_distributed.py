@@ -125,14 +125,10 @@ def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
     settings = ["network.width=8", "network.li_blocks=1", "network.ne_blocks=1", "network.head_width=8"]
     settings += ["batch_size=8", "precision=float32"]
     options = [word for setting in settings for word in ("--param", setting)]
-    torchrun = subprocess.Popen(
-        [
-            sys.executable, "-m", "torch.distributed.run", "--standalone", "--max-restarts", "1",
-            "--nproc-per-node", "2", "worker.py",
-            "train", "-o", "run", "--steps", str(steps), "--device", "cpu", *options,
-        ],
-        cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    command = f"{sys.executable} -m torch.distributed.run --standalone --max-restarts 1 --nproc-per-node 2 worker.py"
+    command += f" train -o run --steps {steps} --device cpu"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    torchrun = subprocess.Popen([*command.split(), *options], cwd=tmp_path, env=environment(), text=True, **pipes)
     try:
         out, err = torchrun.communicate(timeout=100)
     finally:

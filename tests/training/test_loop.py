@@ -4,17 +4,14 @@ import itertools
 import json
 import math
 import resource
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.weights import load_weights
-from splinecli.pixel_sets.store import PixelSet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import loop
@@ -26,7 +23,6 @@ from splinecli.training.objective import compute_losses
 from splinecli.training.run_log import Metrics, read_metrics
 
 CPU = torch.device("cpu")
-MakeSet = Callable[..., PixelSet]
 
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -78,16 +74,12 @@ def losses(trainer: Trainer, steps: int) -> list[float]:
 
 
 @pytest.mark.parametrize(("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")])
-def test_a_run_taken_up_goes_on_as_if_never_stopped(
-    tiny: TrainingConfig, tmp_path: Path, make_set: MakeSet, updates: Any, pixels: str
-) -> None:
+def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, updates, pixels):
     sources = {"generator": {GENERATOR: 1.0}, "set": {}, "both": {GENERATOR: 1.0}}[pixels]
     if pixels != "generator":
         sources[str(make_set().folder)] = 1.0
-    config = replace(
-        tiny, updates=updates, ne_net_updates=2, sources=sources, symmetric_weight=0.02,
-        asymmetric_weight=1e-4, warmup_steps=4,
-    )  # fmt: skip
+    weights = {"symmetric_weight": 0.02, "asymmetric_weight": 1e-4}
+    config = replace(tiny, updates=updates, ne_net_updates=2, sources=sources, warmup_steps=4, **weights)
     whole = Trainer(config, tmp_path / "whole", CPU)
     expected = losses(whole, 6)
     first = Trainer(config, tmp_path / "halves", CPU)
@@ -108,8 +100,8 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_pat
     first.run()
     config = replace(tiny, start_from=str(tmp_path / "first" / WEIGHTS), seed=9)
     second = Trainer(config, tmp_path / "second", CPU)
-    for network in (second.network, second.average):
-        for name, tensor in first.average.state_dict().items():
+    for name, tensor in first.average.state_dict().items():
+        for network in (second.network, second.average):
             assert torch.equal(network.state_dict()[name], tensor.half().float()), name
     second.run()
     # Taken up, it is where it was, not at its start.
@@ -194,9 +186,7 @@ def poison(trainer: Trainer, what: str) -> None:
 
 
 @pytest.mark.parametrize(("what", "updates"), [("loss", "joint"), ("gradient", "alternating")])
-def test_what_is_not_finite_ends_the_run_before_it_does_harm(
-    tiny: TrainingConfig, tmp_path: Path, what: str, updates: Any
-) -> None:
+def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, what, updates):
     trainer = Trainer(replace(tiny, updates=updates), tmp_path, CPU)
     losses(trainer, 2)
     trainer.save()

@@ -112,10 +112,14 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining: T
     assert changed and all(name.startswith("refine_net.") for name in changed)
 
 
+def network_of(config: TrainingConfig) -> SplineNet:
+    torch.manual_seed(0)
+    return SplineNet(config.network)
+
+
 def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "_ENLARGED_SHARE", 0.0)
-    torch.manual_seed(0)
-    network = SplineNet(refining.network)
+    network = network_of(refining)
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
 
     def pool(seed: int) -> ScenePool:
@@ -134,14 +138,11 @@ def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet, monke
     torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
 
 
-def test_a_run_that_continues_has_the_newest_captures(
-    refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monkeypatch):
     """It began with the oldest ones again."""
     monkeypatch.setattr(tasks, "FIRST_EXAMPLES", 2)
     monkeypatch.setattr(tasks, "VALIDATION_SCENES", 0)
-    torch.manual_seed(0)
-    network = SplineNet(refining.network)
+    network = network_of(refining)
     config = replace(refining, sources={str(bumpy_set.folder): 1.0})
     whole, rest = (RefinementTask(config, range(config.shards), CPU) for _ in range(2))
     whole.prepare(network, rank=0, step=0)
@@ -158,8 +159,7 @@ def test_a_run_that_continues_has_the_newest_captures(
 
 
 def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
-    torch.manual_seed(0)
-    network = SplineNet(refining.network)
+    network = network_of(refining)
     pool = ScenePool([(bumpy_set, bumpy_set.entries, 1.0)], network, refining.pixels, 1)
     pool.add()
     maps = stack_maps(pool.examples)

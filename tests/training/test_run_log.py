@@ -20,10 +20,14 @@ ROWS = [
 ]
 
 
-def test_metrics_round_trip(tmp_path: Path) -> None:
-    log = RunLog(tmp_path, 0)
-    for row in ROWS:
+def log_of(folder: Path, rows: list[Metrics] = ROWS, *, tensorboard: bool = False) -> None:
+    log = RunLog(folder, 0, tensorboard=tensorboard)
+    for row in rows:
         log.append(row)
+
+
+def test_metrics_round_trip(tmp_path: Path) -> None:
+    log_of(tmp_path)
     assert read_metrics(tmp_path / METRICS) == ROWS
     text = (tmp_path / METRICS).read_text()
     header, first, *_ = text.splitlines()
@@ -35,9 +39,7 @@ def test_metrics_round_trip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("step", "kept"), [(49, 0), (50, 1), (10**6, 3)])
 def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int) -> None:
-    log = RunLog(tmp_path, 0)
-    for row in ROWS:
-        log.append(row)
+    log_of(tmp_path)
     again = RunLog(tmp_path, step)
     assert (tmp_path / METRICS).exists() == (kept > 0)
     again.append(replace(ROWS[2], step=10**6 + 1))
@@ -46,9 +48,7 @@ def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int)
 
 @pytest.mark.parametrize("step", ["9" * 5000, "²"])
 def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) -> None:
-    log = RunLog(tmp_path, 0)
-    for row in ROWS[:2]:
-        log.append(row)
+    log_of(tmp_path, ROWS[:2])
     with (tmp_path / METRICS).open("a", encoding="utf-8") as file:
         file.write(f"{step},1" + ",1.0" * 9 + "\n")
     again = RunLog(tmp_path, 100)
@@ -69,12 +69,9 @@ def test_tensorboard_s_events(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log = RunLog(tmp_path, 0, tensorboard=True)
-    for row in ROWS:
-        log.append(row)
+    log_of(tmp_path, tensorboard=True)
     events = EventAccumulator(str(tmp_path / EVENTS))
     events.Reload()
-    assert [(event.step, event.value) for event in events.Scalars("loss")] == [
-        (50, 2.0), (100, 1.0), (125, 0.5),
-    ]  # fmt: skip
+    losses = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert losses == [(50, 2.0), (100, 1.0), (125, 0.5)]
     assert [event.step for event in events.Scalars("validation_deg")] == [100, 125]

@@ -1,6 +1,5 @@
 """Sources of training and validation pixels: weights of a mixture, and scenes kept for validation."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,14 +7,13 @@ import pytest
 import torch
 
 from distributions import generator as seeded
+from small_pixel_sets import MakeSet
 from splinecli.errors import InputError
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.sources import PixelSource, open_sets, pixel_source, split_scenes
-
-MakeSet = Callable[..., PixelSet]
 
 
 def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, PixelSource]:
@@ -27,10 +25,8 @@ def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, Pi
     )
 
 
-def assert_same(one: PixelBatch, other: PixelBatch) -> None:
-    for name in ("observations", "light_directions", "valid", "exposure"):
-        assert torch.equal(getattr(one, name), getattr(other, name))
-    assert torch.equal(one.truth.normals, other.truth.normals)
+def parts(batch: PixelBatch) -> tuple[torch.Tensor, ...]:
+    return batch.observations, batch.light_directions, batch.valid, batch.exposure, batch.truth.normals
 
 
 def entries_of(*scenes: str) -> list[Entry]:
@@ -103,7 +99,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     (training, validation), again = draw(5, 60), draw(5, 8)
     for batches, others in ((training, again[0]), (validation, again[1])):
         for batch, other in zip(batches[: len(others)], others, strict=True):
-            assert_same(batch, other)
+            assert all(map(torch.equal, parts(batch), parts(other)))
     assert not torch.equal(draw(6, 1)[0][0].truth.normals, training[0].truth.normals)
     for_validation = {entry.name for entry in split_scenes(pixel_set.entries, config.held_share)[1]}
     stored = rows_of(pixel_set, *({"a", "b", "c"} - for_validation))
@@ -119,14 +115,11 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
 
 def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set: MakeSet, tiny: TrainingConfig) -> None:
     # Both sets have the same three shapes under other names.
-    one = make_set("one", entries=[("a", "a", 20, 20), ("b", "b", 20, 20), ("c", "c", 20, 20)])
-    other = make_set("other", entries=[("x", "x", 20, 20), ("y", "y", 20, 20), ("z", "z", 20, 20)])
-    sources = {str(one.folder): 1.0, str(other.folder): 1.0}
-    source, held = open_sources(replace(tiny, sources=sources))
+    one, other = (make_set(names, entries=[(name, name, 20, 20) for name in names]) for names in ("abc", "xyz"))
+    source, held = open_sources(replace(tiny, sources={str(one.folder): 1.0, str(other.folder): 1.0}))
     assert not normals_of(source.draw(600)) & normals_of(held.draw(600))
     # The only scene of "alone" is a validation scene of the other set, so nothing is left for training.
-    validation_scene = "p" if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else "q"
-    order = ("p", "q") if validation_scene == "p" else ("q", "p")
+    order = ("p", "q") if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else ("q", "p")
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])
     with pytest.raises(InputError, match="all scenes of the set are used for validation"):

@@ -30,14 +30,17 @@ def task(tiny: TrainingConfig, batch: PixelBatch) -> PixelTask:
     return made
 
 
+def errors_deg(network: SplineNet, batch: PixelBatch) -> torch.Tensor:
+    with torch.no_grad():
+        normals = network(batch.observations, batch.light_directions, batch.valid).normals
+    return (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1).acos().rad2deg()
+
+
 def test_validation_is_the_mean_angle_to_the_truth(task: PixelTask, network: SplineNet, batch: PixelBatch) -> None:
     network.train()
     found = task.validation_deg(network, bfloat16=False)
     assert not network.training
-    with torch.no_grad():
-        normals = network(batch.observations, batch.light_directions, batch.valid).normals
-    cosine = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1)
-    assert found == pytest.approx(cosine.acos().rad2deg().mean().item(), abs=1e-3)
+    assert found == pytest.approx(errors_deg(network, batch).mean().item(), abs=1e-3)
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
@@ -45,11 +48,9 @@ def test_the_maps_of_some_pixels(task: PixelTask, network: SplineNet, batch: Pix
     shown = task.sample_maps(network)
     assert len(shown.sparse) == len(shown.dense) == len(shown.truth) == len(shown.error_deg) == SHOWN_PIXELS
     views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
-    inside = cell_directions()[1].numpy()
+    inside, errors = cell_directions()[1].numpy(), errors_deg(network, batch)
     with torch.no_grad():
         dense = network.interpolate(views)
-        normals = network(batch.observations, batch.light_directions, batch.valid).normals
-    cosine = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1)
     for index in range(SHOWN_PIXELS):
         pixel = 5 * index  # spread over the 40
         occupied = views.occupied[pixel, 0].numpy() > 0
@@ -58,4 +59,4 @@ def test_the_maps_of_some_pixels(task: PixelTask, network: SplineNet, batch: Pix
         np.testing.assert_array_equal(np.isfinite(shown.dense[index]), inside)
         np.testing.assert_allclose(shown.dense[index][inside], dense[pixel, 0].numpy()[inside], atol=1e-6)
         np.testing.assert_array_equal(np.isfinite(shown.truth[index]), inside)
-        assert shown.error_deg[index] == pytest.approx(cosine[pixel].acos().rad2deg().item(), abs=0.01)
+        assert shown.error_deg[index] == pytest.approx(errors[pixel].item(), abs=0.01)

@@ -12,6 +12,7 @@ GRACE_SECONDS = 1.5  # time that the command has to clean up
 
 
 TOLD = threading.Event()  # set when the command tells of the interruption itself, so that it is told once
+DEFERRED = threading.Event()  # set when a signal came during an import, which must end first
 _IMPORT_SECONDS = 0.05  # time between two looks at whether an import is done
 _IMPORTS = "<frozen importlib._bootstrap>"
 
@@ -51,6 +52,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt, but during an import only afterwards: trimesh, for one, goes on after any exception."""
     while frame is not None:
         if frame.f_code.co_filename == _IMPORTS:
+            DEFERRED.set()
             again = threading.Timer(_IMPORT_SECONDS, signal.raise_signal, (number,))
             again.daemon = True
             again.start()

@@ -65,7 +65,6 @@ def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -
 
 def test_photographs_may_have_such_names(tmp_path: Path) -> None:
     """All of them: then these names say nothing."""
-    folder = write_capture(
-        tmp_path / "a", np.full((6, 4, 5), 100, np.uint8), ring_lights(6), names="mask_of_a_king_{}.png"
-    )
+    pictures = np.full((6, 4, 5), 100, np.uint8)
+    folder = write_capture(tmp_path / "a", pictures, ring_lights(6), names="mask_of_a_king_{}.png")
     assert read_capture(folder).n_lights == 6

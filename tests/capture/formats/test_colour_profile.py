@@ -162,10 +162,8 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix:
     np.testing.assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
     np.testing.assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
-    assert [str(warning) for warning in found.warnings if warning.code == "display_decoded"] == [
-        'The images say that they are display-encoded (colour profile "Adobe RGB (1998)") and are read as gamma:2.1992.'
-        " Add --transfer linear if their values are linear."
-    ]
+    (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
+    assert '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear' in told
 
 
 def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
@@ -175,10 +173,8 @@ def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
     assert source.radiometry.curve == 1
     assert [warning.code for warning in source.warnings] == ["display_encoded"]
     unread = open_capture(capture(tmp_path / "b", profile(b"mft2" + bytes(40)), PIXELS, ".png"))
-    assert [str(warning) for warning in unread.warnings] == [
-        "The colour profile of 0.png has no curve that can be read, so it does not count. Add --transfer linear, srgb"
-        " or gamma:G."
-    ]
+    (warning,) = unread.warnings
+    assert "The colour profile of 0.png has no curve" in str(warning) and "Add --transfer" in str(warning)
 
 
 def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:

@@ -108,11 +108,11 @@ def test_what_is_no_film_is_refused(tmp_path: Path, content: bytes, problem: str
 
 
 def test_a_truncated_film_is_refused(tmp_path: Path) -> None:
-    film = write_film(tmp_path / "clip.mp4", sphere_film(path_of_lamp(40)), "mp4v")
-    film.write_bytes(film.read_bytes()[:20_000])  # the index at the end is missing
-    with pytest.raises(InputError, match="damaged"):
-        choose_frames(film)
-    film = write_film(tmp_path / "clip.avi", sphere_film(path_of_lamp(40)))
-    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
-    with pytest.raises(InputError, match=r"breaks off: \d+ of 40 frames|damaged"):
-        choose_frames(film)
+    for name, codec, message in (
+        ("clip.mp4", "mp4v", "damaged"),  # the index at the end is missing
+        ("clip.avi", "MJPG", r"breaks off: \d+ of 40 frames|damaged"),
+    ):
+        film = write_film(tmp_path / name, sphere_film(path_of_lamp(40)), codec)
+        film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+        with pytest.raises(InputError, match=message):
+            choose_frames(film)

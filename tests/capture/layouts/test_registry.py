@@ -46,12 +46,8 @@ def test_diligent_and_the_order_of_filenames_txt(tmp_path: Path) -> None:
 def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
     folder = fill(tmp_path / "vase", "a.png b.png outline.png gt.tif lights.txt mask.png normal_gt.npy")
     fill(tmp_path, "other.txt brightness.txt")
-    given = {
-        "lights": tmp_path / "other.txt",
-        "intensities": tmp_path / "brightness.txt",
-        "mask": folder / "outline.png",
-        "ground_truth": folder / "gt.tif",
-    }
+    given = {"lights": tmp_path / "other.txt", "intensities": tmp_path / "brightness.txt"}
+    given |= {"mask": folder / "outline.png", "ground_truth": folder / "gt.tif"}
     files = find_capture_files(folder, Overrides(**given))
     assert [path.name for path in files.images] == ["a.png", "b.png"]
     found = (files.light_directions, files.light_intensities, files.mask, files.ground_truth)

@@ -57,17 +57,14 @@ def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> 
     counted=st.booleans(),
     transposed=st.booleans(),
 )
-def test_directions_round_trip(
-    vectors: list[tuple[float, float, float]], separator: str, counted: bool, transposed: bool
-) -> None:
+def test_directions_round_trip(vectors, separator, counted, transposed):
     values = np.array(vectors)
     rows = [separator.join(repr(float(v)) for v in row) for row in (values.T if transposed else values)]
     with tempfile.TemporaryDirectory() as folder:
         path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
         directions = read_light_directions(path, len(values))
-    np.testing.assert_allclose(
-        directions, values / np.linalg.norm(values, axis=1, keepdims=True), rtol=1e-12, atol=1e-15
-    )
+    expected = values / np.linalg.norm(values, axis=1, keepdims=True)
+    np.testing.assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
 
 
 COMMA = "A comma separates columns; write decimals with a point."
@@ -114,18 +111,15 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
         read_light_intensities(tmp_path / "mask.png", 3)
 
 
-@pytest.mark.parametrize(
-    "text", ["1 2 4\n2 2 2\n1 1 1\n3 3 3", "4\n1,2,4\n2,2,2\n1,1,1\n3,3,3", "1 2 1 3\n2 2 1 3\n4 2 1 3"]
-)
+COLOURED = ("1 2 4\n2 2 2\n1 1 1\n3 3 3", "4\n1,2,4\n2,2,2\n1,1,1\n3,3,3", "1 2 1 3\n2 2 1 3\n4 2 1 3")
+GRAY = ("3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5")
+
+
+@pytest.mark.parametrize("text", COLOURED + GRAY)
 def test_intensities(tmp_path: Path, text: str) -> None:
-    intensities = read_light_intensities(write(tmp_path, text), 4)
-    np.testing.assert_array_equal(intensities, [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]])
-
-
-@pytest.mark.parametrize("text", ["3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5"], ids=["column", "count", "row"])
-def test_gray_intensities_count_for_every_channel(tmp_path: Path, text: str) -> None:
-    intensities = read_light_intensities(write(tmp_path, text), 4)
-    np.testing.assert_array_equal(intensities, np.repeat([[3], [1], [2], [5]], 3, axis=1))
+    """In rows, after a count, or in columns; gray ones count for every channel."""
+    expected = [[3] * 3, [1] * 3, [2] * 3, [5] * 3] if text in GRAY else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
+    np.testing.assert_array_equal(read_light_intensities(write(tmp_path, text), 4), expected)
 
 
 @pytest.mark.parametrize(

@@ -52,15 +52,11 @@ def test_equal_lights_are_left_alone(shine):
 
 
 def test_scenes_that_do_not_determine_intensities():
-    directions = lights(4)
-    assert (
-        estimate_light_intensities((sphere(directions) * INTENSITIES[:4]).astype(np.float32), None, directions) is None
-    )
-    few = (sphere(lights(8)) * INTENSITIES)[:40].astype(np.float32)
-    assert estimate_light_intensities(few, None, lights(8)) is None
-    assert estimate_light_intensities(np.zeros((500, 8), np.float32), None, lights(8)) is None
-    never = (sphere(lights(8)) * INTENSITIES * (np.arange(8) != 3)).astype(np.float32)  # a lamp that did not flash
-    assert estimate_light_intensities(never, None, lights(8)) is None
+    eight = sphere(lights(8)) * INTENSITIES
+    never = eight * (np.arange(8) != 3)  # a lamp that did not flash
+    for observations in (sphere(lights(4)) * INTENSITIES[:4], eight[:40], np.zeros((500, 8)), never):
+        directions = lights(observations.shape[1])
+        assert estimate_light_intensities(observations.astype(np.float32), None, directions) is None
 
 
 @pytest.mark.parametrize("widths", [None, 3.0])
@@ -127,9 +123,8 @@ def test_real_objects_whose_lights_were_measured(shared_data, name):
     measured = source.light_intensities.mean(axis=1)
     for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
         order, directions = list(chosen), capture.light_directions[list(chosen)]
-        found = estimate_light_intensities(
-            (capture.observations[:, order] * measured[order]).astype(np.float32), None, directions
-        )
+        observations = (capture.observations[:, order] * measured[order]).astype(np.float32)
+        found = estimate_light_intensities(observations, None, directions)
         ratio = np.log(found / measured[order])
         # Taken for equal, they would be off by 0.4 to 0.5.
         assert np.std(ratio) < 0.06

@@ -17,12 +17,17 @@ def matte(pixels: int) -> np.ndarray:
     return np.maximum(normals @ LIGHTS.T, 0)
 
 
-def test_matte_pixels_come_back():
+def clipped_at(level: float) -> tuple[np.ndarray, ...]:
+    """500 matte pixels: true, which of their observations are saturated, and all as stored and as restored."""
     truth = matte(500)
-    saturated = truth >= 0.6
-    stored = np.minimum(truth, 0.6).astype(np.float32)
+    stored = np.minimum(truth, level).astype(np.float32)
     restored = stored.copy()
-    restore_saturated(restored, saturated, LIGHTS)
+    restore_saturated(restored, truth >= level, LIGHTS)
+    return truth, truth >= level, stored, restored
+
+
+def test_matte_pixels_come_back():
+    truth, saturated, stored, restored = clipped_at(0.6)
     np.testing.assert_array_equal(restored[~saturated], stored[~saturated])
     assert (restored >= stored).all()
     known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
@@ -33,12 +38,8 @@ def test_matte_pixels_come_back():
 
 
 def test_fewer_than_three_others_still_bound_them():
-    truth = matte(500)
-    saturated = truth >= 0.25
+    truth, saturated, stored, restored = clipped_at(0.25)
     few = ((~saturated).sum(axis=1) > 0) & ((~saturated).sum(axis=1) < 3)
-    stored = np.minimum(truth, 0.25).astype(np.float32)
-    restored = stored.copy()
-    restore_saturated(restored, saturated, LIGHTS)
     assert few.sum() > 20
     assert np.isfinite(restored).all()
     assert np.abs(restored - truth)[few].mean() < 0.9 * np.abs(stored - truth)[few].mean()

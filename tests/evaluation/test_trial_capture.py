@@ -1,4 +1,4 @@
-"""The pixels that are scored: those with ground truth, or a part of them, with their own observations."""
+"""What a trial scores: pixels with ground truth, or a part of them, under lights with noise of the stated size."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,8 @@ import pytest
 from splinecli.capture import Capture
 from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.stored import StoredCapture
-from splinecli.evaluation.trial_capture import scored_rows
+from splinecli.evaluation.trial_capture import scored_rows, tilt_lights
+from splinecli.maths.normals import angle_between_deg, unit
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
 MASK = np.random.default_rng(5).random((9, 7)) < 0.7
@@ -41,3 +42,20 @@ def test_a_part_of_the_pixels(capture: Capture) -> None:
         assert set(part) <= set(scored_rows(capture))
     np.testing.assert_array_equal(parts[0], parts[1])
     assert (parts[0] != parts[2]).any()
+
+
+def test_angles_have_the_wanted_root_mean_square() -> None:
+    lights = np.tile(unit(np.array([[0.3, -0.4, 1.0]])), (20_000, 1))
+    tilted = tilt_lights(lights, 4.0, np.random.default_rng(0))
+    angles = angle_between_deg(tilted, lights)
+    # The standard error of the root mean square of n Gaussians is sigma / sqrt(2 n) = 0.02.
+    assert np.sqrt((angles**2).mean()) == pytest.approx(4.0, abs=0.08)
+    # No direction is preferred: the mean is the light, shortened by the mean cosine.
+    assert angle_between_deg(unit(tilted.mean(axis=0)), lights[0]) < 0.15
+    np.testing.assert_allclose(np.linalg.norm(tilted, axis=1), 1)
+
+
+def test_lights_stay_above_the_horizon() -> None:
+    azimuth = np.linspace(0, 2 * np.pi, 5000)
+    lights = unit(np.stack([np.cos(azimuth), np.sin(azimuth), np.full(5000, 0.001)], axis=1))
+    assert (tilt_lights(lights, 30.0, np.random.default_rng(0))[:, 2] > 0).all()
