@@ -135,6 +135,14 @@ def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:
     assert done.stdout == "set()\n"
 
 
+def test_the_capture_has_a_mask_of_its_own() -> None:
+    images, normals = matte()
+    mask = np.ones(normals.shape[:2], np.bool_)
+    estimate = splinecli.estimate_normals(images, LIGHTS, mask, method="ls")
+    mask[:] = False
+    assert estimate.capture.mask.all()
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
     """A gray edge at or below half of the largest value is outside; any value of a bool mask that is True counts."""

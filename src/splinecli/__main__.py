@@ -18,7 +18,7 @@ def run() -> None:
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
         from splinecli.cli.main import main
 
-        if DEFERRED.is_set():
+        if DEFERRED.is_set():  # otherwise the command would begin, and end soon
             raise KeyboardInterrupt
         code = main()
     except KeyboardInterrupt:  # outside of the command

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from make_pages import EXAMPLES, FILES, man_pages
 
+from make_pages import EXAMPLES, FILES, man_pages
 from splinecli.cli.main import app
 from splinecli.results.files import OWN_FILES
 from splinecli.results.index import INDEX

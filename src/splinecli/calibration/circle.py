@@ -62,7 +62,10 @@ class Circle:
 
 
 def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
-    """Return the circle through most of the outline of the largest part of a mask (H, W). Raises InputError."""
+    """Return the circle through most of the outline of the largest part of a mask (H, W).
+
+    Raises InputError if the outline is not that of a ball.
+    """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     height, width = mask.shape
@@ -83,7 +86,10 @@ def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
 
 
 def find_circle(image: NDArray[Any]) -> Circle:
-    """Return the clearest circle in a gray image (H, W), such as a ball on another background. Raises InputError."""
+    """Return the clearest circle in a gray image (H, W), such as a ball on another background.
+
+    Raises InputError if there is no clear circle.
+    """
     values = image.astype(np.float32)
     # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
     values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)

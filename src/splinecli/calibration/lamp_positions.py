@@ -79,7 +79,10 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
 def _positions(
     balls: Sequence[BallCalibration], matrix: Floats, diameter: float | None, errors: np.random.Generator | None = None
 ) -> tuple[Floats, float, float]:
-    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other."""
+    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
+
+    `errors` draws errors of the pixels; None takes them as they are.
+    """
 
     def error(*shape: int) -> Floats:
         return np.zeros(shape) if errors is None else errors.normal(size=shape)

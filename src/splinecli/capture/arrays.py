@@ -61,7 +61,7 @@ def capture_from_arrays(
         raise UsageError("light_directions is None, but near lamps need positions", hint="Leave pixel_size out")
     directions = placeholders(n_lights) if light_directions is None else _checked_directions(light_directions, n_lights)
     intensities = _checked_intensities(light_intensities, n_lights)
-    inside = np.ones(shape, np.bool_) if mask is None else np.asarray(mask)
+    inside = np.ones(shape, np.bool_) if mask is None else np.array(mask)
     if inside.dtype != np.bool_:  # the rule of mask files for numbers
         inside = inside > max(inside.max(initial=0) / 2, 0)
     if inside.shape != shape:

@@ -10,9 +10,12 @@ from splinecli.capture.restore.white_level import WhiteLevel
 
 @dataclass(frozen=True)
 class CaptureWarning:
-    """A fault of a capture that reduces accuracy, or a decision that was made for the user."""
+    """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
-    code: str  # a name that stays the same when the sentence changes; one of the constants below
+    code: a name that stays the same when the sentence changes; one of the constants below.
+    """
+
+    code: str
     text: str
 
     def __str__(self) -> str:

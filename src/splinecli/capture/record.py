@@ -186,7 +186,7 @@ def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
     """Return the indices as a tuple of ints, in their order.
 
-    Raises UsageError where one is not among n_lights, or comes twice, and for fewer than three.
+    Raises UsageError if an index is not below n_lights or comes twice, or if there are fewer than three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):

@@ -13,7 +13,7 @@ Array = NDArray[np.floating]
 
 
 def shadow_weights(observations: Array) -> Array:
-    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels scaled to a largest one of 1."""
+    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels whose largest observation is 1."""
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
@@ -69,8 +69,7 @@ def fit_robustly(
 
 
 def lit_values(observations: Array, dark_share: float, most: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return at most `most` rows (p,) of observations (P, F), evenly spread over those that are not dark, and their
-    values (p, F), each row scaled to a largest one of 1.
+    """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
 
     Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.
     """

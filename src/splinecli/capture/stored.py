@@ -60,7 +60,7 @@ class StoredCapture:
         return replace(self, capture=capture, saturation=saturation, found_intensities=found)
 
     def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
-        """Return the capture with some of its pixels, rows of the observations that rise, with arrays of its own."""
+        """Return the capture with these rising rows of its observations, with arrays of its own."""
         return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:

@@ -68,7 +68,10 @@ class RoughNormals:
 
 
 def rough_normals(observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]) -> RoughNormals:
-    """Return smoothed normals of a fit of least absolute deviations to observations (P, F) of a mask (H, W)."""
+    """Return smoothed normals of a fit of least absolute deviations.
+
+    Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
+    """
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)

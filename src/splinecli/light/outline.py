@@ -47,7 +47,7 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows, which the border of the image is not; None for none.
+    """Return the rotation of the lights that the outline shows, or None. The border of the image is no outline.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.

@@ -19,13 +19,20 @@ DEFAULT_METHOD = "spline-net"
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Settings of a method, None for its default. Each method ignores those that do not apply to it."""
+    """Settings of a method, None for its default. Each method ignores those that do not apply to it.
 
-    weights: str | None = None  # a shipped name or a file
-    rotations: int | None = None  # number of rotations of the lights whose normals a network averages
-    batch_size: int | None = None  # pixels per batch. A processor computes a batch on each core
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # "auto" is a CUDA GPU if there is one
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"  # "auto" is bfloat16 where the device has it natively
+    weights: a shipped name or a file.
+    rotations: number of rotations of the lights whose normals a network averages.
+    batch_size: pixels per batch. A processor computes a batch on each core.
+    device: where to compute; "auto" is a CUDA GPU if there is one.
+    precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
+    """
+
+    weights: str | None = None
+    rotations: int | None = None
+    batch_size: int | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:

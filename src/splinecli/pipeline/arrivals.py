@@ -24,9 +24,10 @@ class _Seen:
 class Arrivals:
     """The captures in a folder, its subfolders, that are complete and were not returned before.
 
-    A capture is complete when it contains a file named `marker`, or, for None, when nothing in it has changed for some
-    seconds. Folders whose names begin with a dot are left out, and `without`, such as the folder of the results, which
-    is no capture and lies in none. One that changes after it was returned is returned again. The clock never goes back.
+    A capture is complete when it contains a file named `marker`, or, without a marker, when nothing in it has changed
+    for `seconds`. Folders whose names begin with a dot are left out, and `without`, such as the folder of the results,
+    which is no capture and lies in none. One that changes after it was returned is returned again. `clock` never goes
+    back.
     """
 
     def __init__(

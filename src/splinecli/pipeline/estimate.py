@@ -109,7 +109,7 @@ def estimate_capture(
     The capture has the warnings from reading it. `check` returns those about its lights and images
     (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
     is called with the number of pixels that were just estimated, in place of the observer. With `strict`, a warning
-    that an input is probably wrong is an InputError.
+    that an input is probably wrong is an InputError. The observer is shown the stages, the clock measures them.
     """
     clock = clock or Clock()
     clock.begin("check")

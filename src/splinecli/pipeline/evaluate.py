@@ -261,7 +261,7 @@ def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: Met
 
 @lru_cache(maxsize=1)
 class _Scorer:
-    """Scores draws of the command that this worker serves: files may change until the next. Keeps the last capture."""
+    """Scores draws for one command, because files may change between commands. Keeps the last capture in memory."""
 
     def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
         self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}

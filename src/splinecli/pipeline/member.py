@@ -1,4 +1,8 @@
-"""The captures of a batch of `infer`: each folder once, skipped if its results are up to date, and kept if it fails."""
+"""The captures of a batch of `infer`.
+
+A folder that is given twice counts once. A capture whose results are up to date is skipped. The error of one that
+fails is kept.
+"""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class SampledPixels:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate the cells between cells with a value: these are `known` in the result, and all usable ones `filled`.
+    """Interpolate cells between given cells. The result's `known` has the given cells, its `filled` all usable ones.
 
     A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell whose
     neighbours all lie on one side of it stays empty. Values and `known`, 1 in cells with an observation, else 0, are

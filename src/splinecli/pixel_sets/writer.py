@@ -53,7 +53,7 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Return the first setting in which the recipe of an entry differs from another and both values, or None."""
+        """Return in words the first setting in which an entry's recipe differs, with both values, or None."""
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
             if asked.get(key) != found.get(key):

@@ -21,7 +21,7 @@ _DARK = 1e-6  # weight of a pixel that is dark under every light, beside lit one
 
 @dataclass(frozen=True, eq=False)
 class HalfCapture:
-    """A capture whose pixels are the means of blocks of 2 x 2 pixels of another one, where its mask has any."""
+    """A capture of half the size: each pixel is the mean of the masked ones in a block of 2 x 2 of another capture."""
 
     mask: NDArray[np.bool_]  # (H / 2, W / 2), with Q true pixels
     observations: Floats  # (Q, F)

@@ -95,7 +95,7 @@ def write_estimate(
     clock: Clock,
     more: Iterable[tuple[str, Content]] = (),
 ) -> dict[str, Any]:
-    """Write the results of a capture into `folder` and return the report of report_of, finished.
+    """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
     The files replace those of an earlier run in the folder (see new_files), which the caller holds. The formats are
     keys of NORMALS; `more` are names and contents of further files of OWN_FILES. Writing is the last stage of the

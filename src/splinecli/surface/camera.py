@@ -27,9 +27,9 @@ def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> 
 def image_points(
     points: NDArray[np.floating], shape: tuple[int, ...], camera_matrix: NDArray[np.floating] | None
 ) -> Floats:
-    """Return the columns and rows (P, 2) at which a camera (3, 3), or an orthographic one for None, sees points (P, 3).
+    """Return the columns and rows (P, 2) at which a camera sees points (P, 3); without a matrix it is orthographic.
 
-    The points are from the camera, or for None in pixels from the centre of the image of `shape`, height and width.
+    The points are from the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
     """
     if camera_matrix is None:
         return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)

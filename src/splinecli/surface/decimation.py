@@ -140,8 +140,8 @@ def _normal_texture(
 ) -> NDArray[np.uint8]:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
 
-    `points` (V, 2) are the columns and rows of the vertices in the image. The normal map (H, W, 3) is zero off the
-    object.
+    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals`
+    and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)

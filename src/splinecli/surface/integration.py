@@ -97,8 +97,8 @@ def relief_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) 
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
     Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
-    pulled to height zero. Of a wave of k radians per pixel, this share is kept: k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2).
-    Raises InputError if the mask is empty.
+    unit in the mask, x right, y up, z to the camera, pulled to height zero. Of a wave of k radians per pixel, this is
+    kept: k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
     return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(np.float32)

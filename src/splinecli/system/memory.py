@@ -31,7 +31,7 @@ def available_memory() -> float:
 
 
 def own_groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups that limit cpu or memory, and of those above them."""
+    """Yield the folders of this process's control groups that limit `controller`, cpu or memory, and of those above."""
     try:
         lines = _GROUPS.read_text("utf-8").splitlines()
     except OSError:

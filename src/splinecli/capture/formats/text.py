@@ -82,7 +82,7 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
 
-    Raises InputError where it is missing, not `expected`, as messages call it, or has more than `most` bytes.
+    Raises InputError if it is missing, no file, or longer than `most` bytes. Messages say that `expected` was expected.
     """
     check_file(path, expected, pipe=True)
     with reading(path):

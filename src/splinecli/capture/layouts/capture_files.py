@@ -110,7 +110,10 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
 def find_images(
     folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
 ) -> tuple[tuple[Path, ...], bool]:
-    """Return the images of a folder, and whether filenames.txt names them; see list_images. Raises NoImagesError."""
+    """Return the images of a folder, and whether filenames.txt names them; see list_images.
+
+    Raises NoImagesError for a folder without images, InputError for a wrong filenames.txt.
+    """
     filenames = find_named(folder, [FILENAMES])
     if filenames is not None:
         return read_image_list(filenames), True
@@ -205,6 +208,6 @@ def find_lights(folder: Path) -> Path | None:
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", "..", and a trailing slash; a link keeps its. Raises InputError."""
+    """Return the folder's own name, also for ".", ".." and a trailing slash, of a link its name. Raises InputError."""
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"

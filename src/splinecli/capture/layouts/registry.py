@@ -158,7 +158,10 @@ def _gather(
     ground_truth: Sequence[str] = GROUND_TRUTH,
     others: tuple[Path, ...] = (),
 ) -> CaptureFiles:
-    """Return the images and lights with the other files of the folder. Files named by the user replace those."""
+    """Return the capture's files: the images, the lights, and what else the folder has.
+
+    Files that the user names come before those of the folder.
+    """
     return CaptureFiles(
         layout,
         folder_name(folder),
