@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,26 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
     pictures = shading * (1 if distant else 150.0**2 / distance**2)
     stored = np.rint(pictures * 30_000).astype(np.uint16)
     return write_capture(folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1)
+
+
+@dataclass(kw_only=True)
+class Teacher:
+    """What estimators with confidence have in common; it counts the pixels that it is asked for."""
+
+    name: str = "taught"
+    weights: None = None
+    device: str = "cpu"
+    precision: str = "float32"
+    fingerprint: str = "taught"
+    tells_confidence: bool = True
+    asked: int = 0
+
+    def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
+
+    def estimate_with_error(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+        """Return normals (P, 3) and the distributions (P, 2) of their errors."""
+        raise NotImplementedError
 
 
 def evaluate(captures: Any, estimators: Any, protocol: Any) -> Any:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from scenes import cap_directions, shade, spiral_lights
+from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg, unit
@@ -27,26 +27,16 @@ SMALL = StudentSize(sample=800, steps=80, width=32)
 
 
 @dataclass
-class Teacher:
-    """Knows the normal and the error of each pixel by heart. Counts the pixels it is asked for."""
+class Remembering(Teacher):
+    """Knows the normal and the error of each pixel by heart."""
 
     observations: NDArray[np.float32]
     normals: Floats
     errors: Floats
-    name: str = "taught"
-    weights: None = None
-    device: str = "cpu"
-    precision: str = "float32"
-    fingerprint: str = "taught"
-    tells_confidence: bool = True
-    asked: int = 0
     places: dict[bytes, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.places = {row.tobytes(): place for place, row in enumerate(self.observations)}
-
-    def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Floats:
-        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     def estimate_with_error(
         self, observations: Any, light_directions: Any, *, progress: Any = None
@@ -78,13 +68,13 @@ def distant(observations: NDArray[np.float32]) -> LightOf:
     return lambda rows: LampLight(observations[rows], LIGHTS)
 
 
-def learn(teacher: Teacher, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
+def learn(teacher: Remembering, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
     return distil(teacher, distant(teacher.observations), len(teacher.observations), size, **options)
 
 
-def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2) -> Teacher:
+def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2) -> Remembering:
     """A teacher who expects the same error everywhere."""
-    return Teacher(observations, normals, np.tile(log_median(degrees), (len(normals), 1)))
+    return Remembering(observations, normals, np.tile(log_median(degrees), (len(normals), 1)))
 
 
 def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
@@ -126,7 +116,7 @@ def test_it_learns_where_its_teacher_is_unsure() -> None:
     dull = np.arange(6000) % 2 == 0
     observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
     errors = np.where(dull[:, None], log_median(1), log_median(12))
-    found = learn(Teacher(observations, normals, errors))
+    found = learn(Remembering(observations, normals, errors))
     learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
     truth = confidence(errors.astype(np.float32))
     assert np.abs(learned[dull].mean() - truth[dull].mean()) < 0.1

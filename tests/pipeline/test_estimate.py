@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import cap_directions, spiral_lights
+from scenes import Teacher, cap_directions, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
 from splinecli.methods import distilled
@@ -21,21 +21,11 @@ LIGHTS = spiral_lights(6, 40)
 
 
 @dataclass
-class Teacher:
+class Slow(Teacher):
     """Least squares with an error, or random normals, that takes its time."""
 
     random: bool = False
     seconds: float = 0.0
-    name: str = "taught"
-    weights: None = None
-    device: str = "cpu"
-    precision: str = "float32"
-    fingerprint: str = "taught"
-    tells_confidence: bool = True
-    asked: int = 0
-
-    def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
-        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     def estimate_with_error(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
         self.asked += len(observations)
@@ -52,7 +42,7 @@ def capture(count: int) -> Capture:
 
 
 def test_small_captures_and_exact_ones_are_not_distilled() -> None:
-    teacher = Teacher()
+    teacher = Slow()
     assert distil_for(capture(3000), teacher, None) == (None, [])
     assert distil_for(capture(AUTOMATIC_FROM), teacher, False) == (None, [])
     assert teacher.asked == 0
@@ -60,7 +50,7 @@ def test_small_captures_and_exact_ones_are_not_distilled() -> None:
 
 def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
-    teacher = Teacher()
+    teacher = Slow()
     found, warnings = distil_for(capture(3000), teacher, True)
     assert warnings == []
     assert teacher.asked == found.distillation.sample == 750
@@ -71,7 +61,7 @@ def test_large_captures_are_distilled_where_that_is_faster(monkeypatch, learning
     """The teacher takes at least 20 microseconds a pixel, so 2 seconds for all and 0.002 for the sample."""
     monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: learning)
     monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
-    found, warnings = distil_for(capture(AUTOMATIC_FROM), Teacher(seconds=0.02), None)
+    found, warnings = distil_for(capture(AUTOMATIC_FROM), Slow(seconds=0.02), None)
     assert (found is not None) == faster
     assert warnings == []
 
@@ -79,7 +69,7 @@ def test_large_captures_are_distilled_where_that_is_faster(monkeypatch, learning
 def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = StudentSize(500, 50, 16), StudentSize(900, 50, 16)
     monkeypatch.setattr(estimate, "student_sizes", lambda _: sizes)
-    teacher = Teacher(random=True)
+    teacher = Slow(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None
     assert warning.code == "not_distilled" and "where it expects errors of 2.9 degrees" in warning.text
@@ -89,7 +79,7 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
 def test_refused() -> None:
     for few, estimator, problem in (
         (capture(3000), LeastSquares(), "method ls gives no confidence and cannot be distilled"),
-        (capture(200), Teacher(), "matte: 200 pixels are too few to distil"),
+        (capture(200), Slow(), "matte: 200 pixels are too few to distil"),
     ):
         with pytest.raises(UsageError, match=problem):
             distil_for(few, estimator, True)
@@ -102,5 +92,5 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network(monkeypatch:
     dark = capture(AUTOMATIC_FROM)
     dark.observations[100:] = 0
     with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil"):
-        distil_for(dark, Teacher(), True)
-    assert distil_for(dark, Teacher(seconds=0.02), None) == (None, [])
+        distil_for(dark, Slow(), True)
+    assert distil_for(dark, Slow(seconds=0.02), None) == (None, [])

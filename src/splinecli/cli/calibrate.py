@@ -6,7 +6,6 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.shared import complete_curves, parse_circle, record_from
 
 
 def calibrate(
@@ -34,7 +33,7 @@ def calibrate(
         "auto",
         metavar="CURVE",
         help="Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
-        autocompletion=complete_curves,
+        autocompletion=shared.complete_curves,
     ),
     compare: Path | None = Option(
         None, metavar="FILE", help="Compare the result with the light directions in a text file."
@@ -59,8 +58,7 @@ def calibrate(
 
     from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
-    options = record_from(
-        CalibrateOptions, given, circles=tuple(parse_circle(text) for text in circle or ()), masks=tuple(mask or ())
-    )
+    circles = tuple(shared.parse_circle(text) for text in circle or ())
+    options = shared.record_from(CalibrateOptions, given, circles=circles, masks=tuple(mask or ()))
     report = calibrate_lights(options, Messages(quiet=quiet))
     print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

@@ -7,14 +7,13 @@ from typer import Argument, Option
 from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.shared import FirstLight, LightForm, record_from
 from splinecli.errors import InputError
 
 
 def info(
     capture: Path = Argument(..., metavar="CAPTURE", help="Folder with the images of one object, or a film."),
     lights: Path | None = shared.LIGHTS,
-    first_light: FirstLight | None = shared.FIRST_LIGHT,
+    first_light: shared.FirstLight | None = shared.FIRST_LIGHT,
     intensities: Path | None = shared.INTENSITIES,
     light_positions: Path | None = shared.LIGHT_POSITIONS,
     light_distance: float | None = shared.LIGHT_DISTANCE,
@@ -30,7 +29,7 @@ def info(
     flat_field: Path | None = shared.FLAT_FIELD,
     white_level: float | None = shared.WHITE_LEVEL,
     light_frame: str | None = shared.LIGHT_FRAME,
-    lights_format: LightForm = shared.LIGHTS_FORMAT,
+    lights_format: shared.LightForm = shared.LIGHTS_FORMAT,
     check_lights: bool = Option(
         False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
     ),
@@ -59,7 +58,7 @@ def info(
     messages = Messages(quiet=quiet)
     report = describe_capture(
         capture,
-        record_from(Reading, given),
+        shared.record_from(Reading, given),
         messages,
         plot=plot,
         overwrite=overwrite,

@@ -6,7 +6,6 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.shared import NormalConvention, complete_list, record_from, split_commas
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 
@@ -23,7 +22,7 @@ def integrate(
         help="Text file of the 3 x 3 camera matrix in pixels, for a perspective camera. [default: as in report.json"
         " beside the normal map, or orthographic]",
     ),
-    convention: NormalConvention | None = Option(
+    convention: shared.NormalConvention | None = Option(
         None,
         help="Green channel of a normal map of colours: opengl is y up, directx is y down. [default: as in report.json"
         " beside it, or opengl]",
@@ -71,7 +70,7 @@ def integrate(
         metavar="LIST",
         help=f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or"
         " as a 16-bit picture (png). exr needs the extra 'exr'.",
-        autocompletion=complete_list(SURFACE_FILES),
+        autocompletion=shared.complete_list(SURFACE_FILES),
     ),
     decimate: int | None = Option(
         None,
@@ -96,6 +95,7 @@ def integrate(
 
     from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
 
-    options = record_from(IntegrateOptions, given, formats=split_commas(formats, "--format", SURFACE_FILES))
+    files = shared.split_commas(formats, "--format", SURFACE_FILES)
+    options = shared.record_from(IntegrateOptions, given, formats=files)
     report = integrate_normal_map(options, Messages(quiet=quiet))
     print_report(report, summary_line(options, report), as_json=as_json, quiet=quiet)

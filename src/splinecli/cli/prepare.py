@@ -8,7 +8,6 @@ from typer import Argument, Option
 from splinecli.capture import find_captures
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.shared import parse_cluster
 
 
 def prepare(
@@ -60,7 +59,7 @@ def prepare(
         as_stored=as_stored,
         white_level=white_level,
         update=update,
-        cluster=parse_cluster(workers),
+        cluster=shared.parse_cluster(workers),
         observer=Messages(quiet=quiet),
     )
     in_words = (

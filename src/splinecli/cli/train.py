@@ -11,7 +11,6 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.shared import Device, complete_weights
 from splinecli.errors import UsageError, printable
 from splinecli.training import defaults
 
@@ -44,7 +43,7 @@ def train(
         None,
         metavar="NAME|FILE",
         help="Begin with these weights. [default: random weights; preset refine: spline-net]",
-        autocompletion=complete_weights,
+        autocompletion=shared.complete_weights,
     ),
     generator_weight: float | None = Option(
         None, metavar="W", min=0, help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]"
@@ -70,7 +69,7 @@ def train(
     tensorboard: bool = Option(
         False, "--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."
     ),
-    device: Device = shared.DEVICE,
+    device: shared.Device = shared.DEVICE,
     quiet: bool = shared.QUIET,
 ) -> None:
     """Train LI-Net and NE-Net, or with --preset refine the refinement net.

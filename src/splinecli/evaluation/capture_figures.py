@@ -93,9 +93,11 @@ def has_observation_maps(method: str) -> bool:
 def file_stems(names: Sequence[str]) -> list[str]:
     """Return a different stem of a file name for each capture, also where names have slashes."""
     stems: list[str] = []
+    taken: set[str] = set()
     for name in names:
-        taken = {*stems, *(f"{stem}{MAPS}" for stem in stems)}
-        stems.append(free_name(name.replace("/", "_"), lambda stem: bool({stem, f"{stem}{MAPS}"} & taken), "_"))  # noqa: B023
+        stem = free_name(name.replace("/", "_"), lambda stem: not taken.isdisjoint((stem, f"{stem}{MAPS}")), "_")
+        taken.update((stem, f"{stem}{MAPS}"))
+        stems.append(stem)
     return stems
 
 

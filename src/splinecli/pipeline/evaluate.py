@@ -256,14 +256,19 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
 
 
 def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
-    return _Scorer(command, fingerprints, options).score(draw)
+    return _scorer(command, fingerprints, options).score(draw)
 
 
 @lru_cache(maxsize=1)
-class _Scorer:
-    """Scores draws for one command, because files may change between commands. Keeps the last capture in memory."""
+def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
+    """Return the scorer of the command that this worker serves: files may change until the next command."""
+    return _Scorer(fingerprints, options)
 
-    def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
+
+class _Scorer:
+    """Scores draws, and keeps the last capture in memory."""
+
+    def __init__(self, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
         self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
         for name, expected in fingerprints:
             if (found := self._estimators[name].fingerprint) != expected:
