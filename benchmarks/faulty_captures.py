@@ -184,7 +184,7 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
             light_direction_error_share=0, light_intensity_error_share=0.2 * noisy, unequal_lights_share=unequal,
             saturated_share=0.1, sensor_noise=noisy, eight_bit_share=0.3,
         )  # fmt: skip
-        seen, _ = photograph_scene(radiance.float(), torch.from_numpy(single), config, generator)
+        seen, *_ = photograph_scene(radiance.float(), torch.from_numpy(single), config, generator)
         observations = np.asarray(seen.numpy(), np.float32)
         stated = lights
         if kind == "curve":

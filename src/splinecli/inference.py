@@ -22,7 +22,7 @@ from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
 from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import TILE_PIXELS, confidence, refiner_of, tells_confidence
+from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, tells_confidence
 from splinecli.methods.near_light import find_surface
 from splinecli.system.memory import return_freed_memory
 from splinecli.system.progress import Progress
@@ -127,6 +127,7 @@ def _estimate(
         normals[rows] = light.in_frame_of_capture(found)
 
     light_of = partial(light_on, capture)
+    estimator = for_capture(estimator, light_of, capture.n_pixels)
     for rows in parts_of_rows(capture.n_pixels, tile_pixels):
         estimate(rows, light_of(rows), progress)
     refiner = refiner_of(estimator)

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
+from splinecli.methods import make_estimator
+from splinecli.methods.estimator import for_capture
 from splinecli.methods.networks import NetworkEstimator, rotations_of
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
@@ -79,3 +82,43 @@ def test_networks_in_several_threads_count_apart() -> None:
             pool.submit(network.estimate, observations, lights, progress=counts.append)
     assert [sum(counts) for counts in done] == [60, 60, 60]
     assert done[0] == done[1] == done[2]
+
+
+SEES = {"map_size": 16, "set_width": 16, "set_layers": 1, "error_head": True, "sees_capture": True}
+
+
+def light_of(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightOf:
+    return lambda rows: LampLight(observations[rows], lights)
+
+
+def test_pixels_see_their_capture_and_not_their_tile() -> None:
+    observations, lights = pixels(600)
+    network = estimator(random_network(**SEES), batch_size=100)
+    whole = network.for_capture(light_of(observations, lights), 600)
+    expected, errors = whole.estimate_with_error(observations, lights)
+    for tile in (slice(0, 30), slice(250, 600)):
+        found, found_errors = whole.estimate_with_error(observations[tile], lights)
+        assert angle_between_deg(found, expected[tile]).max() < 0.01
+        assert np.allclose(found_errors, errors[tile], atol=1e-3)
+    # Alone, the pixels of a call are a capture.
+    assert angle_between_deg(network.estimate(observations, lights), expected).max() < 0.01
+    assert angle_between_deg(network.estimate(observations[:30], lights), expected[:30]).max() > 0.1
+    # The network that was given sees nothing of this capture.
+    assert whole is not network and network._context is None
+
+
+def test_a_black_background_says_nothing_of_the_object() -> None:
+    observations, lights = pixels(200)
+    network = estimator(random_network(**SEES))
+    expected = network.estimate(observations, lights)
+    dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
+    with_background = np.concatenate((dark[:400], observations, dark[400:]))
+    found = network.for_capture(light_of(with_background, lights), 1000).estimate(with_background, lights)
+    assert angle_between_deg(found[400:600], expected).max() < 0.01
+    assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
+
+
+def test_methods_that_see_no_capture_stay_as_they_are() -> None:
+    observations, lights = pixels(20)
+    for method in (estimator(), make_estimator("ls")):
+        assert for_capture(method, light_of(observations, lights), 20) is method

@@ -79,6 +79,29 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
     assert all((normals == normal).all(axis=1).any() for normal in batch.truth.normals[few].numpy())
 
 
+def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set: MakeSet) -> None:
+    pixel_set = make_set()
+    source = source_of(pixel_set, replace(FAULTLESS, capture_pixels=10))
+    names = {n.tobytes(): entry.name for entry in pixel_set.entries for n in pixel_set.load(entry).normals}
+    entries = []
+    for _ in range(40):
+        batch = source.draw(100)
+        assert batch.captures == 10
+        for capture in range(10):
+            rows = slice(capture, None, 10)
+            (name,) = {names[normal.tobytes()] for normal in batch.truth.normals[rows].numpy()}
+            entries.append(name)
+            assert len(batch.light_directions[rows].unique(dim=0)) == 1
+            assert len(batch.valid[rows].unique(dim=0)) == 1
+        radiance = batch.observations / batch.exposure
+        stored = {v for e in pixel_set.entries for v in pixel_set.load(e).observations.round(4).ravel().tolist()}
+        unclipped = (batch.observations < 0.99) & batch.valid
+        assert {round(v, 4) for v in radiance[unclipped].tolist()} <= {round(v, 4) for v in stored}
+    # An entry has as much weight as its pixels: 40, 30 and 20.
+    shares = [entries.count(name) / len(entries) for name in "abc"]
+    assert shares == pytest.approx([4 / 9, 3 / 9, 2 / 9], abs=0.1)
+
+
 def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
     """Matte pixels under lights at the centres of a third of the cells."""
     directions, inside = cell_directions()

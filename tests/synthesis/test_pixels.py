@@ -13,6 +13,7 @@ from splinecli.synthesis.pixels import (
     PixelGenerator,
     PixelGeneratorConfig,
     draw_scene,
+    draw_shared_materials,
     draw_visible_normals,
 )
 
@@ -145,3 +146,34 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
     assert stats.kstest(squared, stats.uniform(0, 0.997**2).cdf).pvalue > 1e-3
     azimuth = torch.atan2(normals[:, 1], normals[:, 0]).numpy()
     assert stats.kstest(azimuth, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
+
+
+SHARED = replace(NOTHING, capture_pixels=16)
+
+
+def test_pixels_of_a_capture_share_its_lights_and_its_exposure() -> None:
+    batch = draw(160, replace(SHARED, light_direction_error_share=1.0))
+    assert batch.captures == 10
+    # Pixel p belongs to capture p % 10.
+    for shared in (batch.light_directions, batch.valid, batch.exposure):
+        captures = shared.unflatten(0, (16, 10))
+        assert torch.equal(captures, captures[:1].expand_as(captures))
+    assert len(batch.exposure.unique()) == 10
+    # Without noise, they show the radiance of their true lights at that exposure.
+    exact = draw(160, SHARED)
+    radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid
+    clipped = radiance > 1
+    torch.testing.assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6)
+    brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))
+    assert (brightest > 0.15).all() and (brightest <= 1).all()
+    assert draw(10, SHARED).captures == 1  # of fewer pixels than usual
+
+
+def test_a_capture_has_few_materials() -> None:
+    material = draw_shared_materials(64 * 2000, 2000, torch.Generator().manual_seed(0))
+    base, roughness = (values.view(64, 2000).T for values in (material.base, material.roughness))
+    counts = np.array([len(values.unique()) for values in base])
+    assert counts.max() == 8
+    assert (counts == 1).mean() == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / 2000))
+    one_gloss = np.array([len(values.unique()) == 1 for values in roughness])[counts > 1]
+    assert one_gloss.mean() == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(one_gloss)))

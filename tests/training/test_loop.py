@@ -110,6 +110,24 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_pat
     assert all(torch.equal(again.network.state_dict()[name], trained[name]) for name in trained)
 
 
+def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(tiny: TrainingConfig, tmp_path: Path) -> None:
+    alone = replace(tiny, network=replace(tiny.network, map_size=16, set_width=16, set_layers=1))
+    first = Trainer(alone, tmp_path / "first", CPU)
+    first.run()
+    seeing = replace(
+        alone,
+        network=replace(alone.network, sees_capture=True),
+        pixels=replace(alone.pixels, capture_pixels=8),
+        start_from=str(tmp_path / "first" / WEIGHTS),
+    )
+    second = Trainer(seeing, tmp_path / "second", CPU)
+    second.run()
+    contexts = load_weights(tmp_path / "second" / WEIGHTS).network.set_branch.contexts
+    assert contexts is not None and contexts[0].join[2].weight.any()
+    with pytest.raises(ModelError, match="with sees_capture = True, the run's has False"):
+        Trainer(replace(alone, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
+
+
 def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path / "first", CPU).run()
     config = replace(

@@ -1,5 +1,6 @@
 """What is minimised: which terms, by which weights, and whose parameters they move."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,10 @@ from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig, preset
 from splinecli.training.loop import Trainer
 from splinecli.training.objective import (
+    angles,
     asymmetric_loss,
     asymmetries,
+    balanced,
     compute_losses,
     dense_truth_in_frame,
     part_of_step,
@@ -120,6 +123,27 @@ def test_the_total_is_the_weighted_sum_of_its_terms(tiny, network, batch, part, 
     assert found.total.item() == pytest.approx(total.item(), rel=1e-5)
 
 
+def test_a_degree_counts_more_on_a_capture_that_is_nearly_right() -> None:
+    errors = torch.tensor([math.radians(1.0), math.radians(20.0)], requires_grad=True)
+    (gradient,) = torch.autograd.grad(balanced(errors), errors)
+    assert (gradient[0] / gradient[1]).item() == pytest.approx(math.sqrt(22.5 / 3.5))
+    typical = torch.tensor([math.radians(2.5)] * 3)
+    assert balanced(typical).item() == pytest.approx(typical[0].item())
+    assert balanced(typical, torch.full((3,), math.radians(7.5))).item() == pytest.approx(typical[0].item() / 2**0.5)
+
+
+def test_the_angle_of_captures_is_balanced(tiny: TrainingConfig, network: SplineNet) -> None:
+    pixels = replace(tiny.pixels, capture_pixels=8)
+    batch = PixelGenerator(pixels, torch.Generator().manual_seed(0)).draw(32)
+    with torch.no_grad():
+        found = compute_losses(network, batch, replace(tiny, **SILENT | {"angle_weight": 1.0}))
+        views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
+        normals = network.estimate(views, network.interpolate(views), captures=4).normals
+        of_pixels = angles(normals, to_pixel_frame(batch.truth.normals, views))
+    assert found.angle.item() == pytest.approx(of_pixels.mean().item(), rel=1e-5)
+    assert found.total.item() == pytest.approx(balanced(of_pixels.view(8, 4).mean(dim=0)).item(), rel=1e-5)
+
+
 @pytest.mark.parametrize("mirror", [False, True])
 def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: bool) -> None:
     # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map there.
@@ -129,7 +153,7 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     lights = directions[inside][3::29]
     exposure = torch.linspace(0.3, 2, 40)[:, None]
     observations = batch.truth.radiance(lights) * exposure
-    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.truth, exposure)
+    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.truth, exposure, len(exposure))
     # Without a turn beyond multiples of 90 degrees, centres stay centres.
     views = network.build_maps(observations, lights)._replace(
         cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror

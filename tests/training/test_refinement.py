@@ -38,7 +38,7 @@ def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tenso
 
 def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
     radiance, directions = scene()
-    observations, calibrated = photograph_scene(radiance, directions, FLAWLESS, torch.Generator().manual_seed(0))
+    observations, calibrated, _ = photograph_scene(radiance, directions, FLAWLESS, torch.Generator().manual_seed(0))
     exposure = (observations / radiance)[radiance < 0.9].unique()
     assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
     torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
@@ -49,7 +49,7 @@ def test_errors_of_calibration_are_those_of_the_capture() -> None:
     """Every pixel has the same factor under one light."""
     radiance, directions = scene()
     config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
-    observations, _ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(1))
+    observations, *_ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(1))
     factors = torch.where(radiance < 0.9, observations / radiance, torch.nan)
     spread = factors.nan_to_num(0).amax(0) - factors.nan_to_num(9).amin(0)
     assert spread.max() < 1e-5
@@ -63,7 +63,7 @@ def test_saturated_captures_are_restored() -> None:
     normals = torch.nn.functional.normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
     radiance = normals @ directions.T * torch.rand(400, 1, generator=generator)
     config = replace(FLAWLESS, saturated_share=1.0)
-    observations, _ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(2))
+    observations, *_ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(2))
     assert observations.max() > 1.02
     ratio = observations / radiance
     assert ratio.std() < 0.03 * ratio.mean()

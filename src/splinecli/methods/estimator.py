@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
+    from splinecli.light.lamp_light import LightOf
     from splinecli.refinement.refiner import NetworkRefiner
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
@@ -85,6 +86,21 @@ def refiner_of(estimator: Estimator) -> NetworkRefiner | None:
     """Return what corrects the estimator's map of normals by what lies around each pixel, if anything does."""
     refiner: NetworkRefiner | None = getattr(estimator, "refiner", None)
     return refiner
+
+
+AnyEstimator = TypeVar("AnyEstimator", bound=Estimator)
+
+
+def for_capture(estimator: AnyEstimator, light_of: LightOf, n_pixels: int) -> AnyEstimator:
+    """Return the estimator for the pixels of one capture: some see a sample of them first.
+
+    Args:
+        light_of: gives the observations and the light directions of some pixels.
+        n_pixels: of the capture.
+    """
+    look_at = getattr(estimator, "for_capture", None)
+    found: AnyEstimator = estimator if look_at is None else look_at(light_of, n_pixels)
+    return found
 
 
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:

@@ -1,5 +1,8 @@
 """SPLINE-Net and CNN-PS as estimators. They average the normals of several rotations of each pixel's lights."""
 
+from __future__ import annotations
+
+import copy
 from typing import Literal
 
 import numpy as np
@@ -8,15 +11,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
+from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.observation_map import rotate_about_view_axis, sparse_map
 from splinecli.methods.batched import estimate_in_batches
-from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations
+from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, directions_at
+from splinecli.networks.capture_context import SAMPLE, CaptureContext
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
 
 Precision = Literal["float32", "bfloat16"]
+
+_CANDIDATES = 4096  # pixels from which those are chosen that the others see
+_DARK_SHARE = 0.02  # of the brightest of them; darker ones, such as a black background, say nothing
 
 ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
@@ -64,6 +72,32 @@ class NetworkEstimator:
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
+        self._context: CaptureContext | None = None
+
+    @torch.no_grad()
+    def for_capture(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+        """Return this estimator for the pixels of one capture, of which it has seen a sample.
+
+        Without it, the pixels of each call of `estimate` count as a capture.
+
+        Args:
+            light_of: gives the observations and the light directions of some pixels.
+            n_pixels: of the capture.
+        """
+        if not self.network.config.sees_capture or not n_pixels:
+            return self
+        light = light_of(_evenly(np.arange(n_pixels), _CANDIDATES))
+        brightest = light.observations.max(axis=1)
+        lit = np.flatnonzero(brightest >= _DARK_SHARE * np.quantile(brightest, 0.99))
+        rows = _evenly(lit, SAMPLE)
+        sample, lights = (
+            torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for values in (light.observations[rows], directions_at(light.directions, rows))
+        )
+        found = copy.copy(self)
+        with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+            found._context = self.network.look_at(sample, lights)
+        return found
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
@@ -82,6 +116,11 @@ class NetworkEstimator:
 
         The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
+        if self._context is None and self.network.config.sees_capture and len(observations):
+            alone = self.for_capture(
+                lambda rows: LampLight(observations[rows], directions_at(light_directions, rows)), len(observations)
+            )
+            return alone.estimate_with_error(observations, light_directions, progress=progress)
         results = estimate_in_batches(
             self._average_rotations,
             observations,
@@ -99,7 +138,7 @@ class NetworkEstimator:
         total = batch.new_zeros(len(batch), 5)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
             for rotation in self._rotations:
-                normals, error = self.network(batch, lights, rotation=rotation)
+                normals, error = self.network(batch, lights, rotation=rotation, context=self._context)
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3:] += error
@@ -145,6 +184,11 @@ class NetworkEstimator:
 
         inside = network.inside.expand_as(dense)
         return known(maps.sparse, maps.occupied), known(dense, inside), known(every.values, every.occupied)
+
+
+def _evenly(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Return at most so many of the rows, evenly spread."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.intp)]
 
 
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:

@@ -36,6 +36,7 @@ class NetworkConfig:
     refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
     set_width: int = 0  # channels of the set branch, 0 for none. Compact size only.
     set_layers: int = 3  # attention layers of the set branch
+    sees_capture: bool = False  # whether pixels see a sample of their capture. Needs a set branch.
 
     @property
     def is_canonical(self) -> bool:
@@ -80,6 +81,8 @@ class NetworkConfig:
                 raise ModelError(f"network setting {name!r} needs the size 'compact'")
         if config.refines and not config.error_head:
             raise ModelError("network setting 'refines' needs 'error_head'")
+        if config.sees_capture and not config.set_width:
+            raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
         if config.set_width % HEAD_WIDTH:
             raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
         if config.grid != "even" and config.size != "paper":

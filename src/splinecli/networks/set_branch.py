@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.networks.capture_context import CaptureContext, ContextLayer, Summary, brightness_level
 from splinecli.networks.layers import zeroed
 
 HEAD_WIDTH = 16  # channels of an attention head
@@ -19,24 +20,37 @@ class SetBranch(nn.Module):
     direction, value, residual of the Lambertian fit, and the cosines between the starting normals and its light and
     half vector. The tokens give a weight and a corrected value for each observation, and least squares over these
     gives a normal. At first the weights are equal and the values are not corrected.
+
+    If it sees the capture, the pixel's token sees those of other pixels after each layer.
     """
 
-    def __init__(self, width: int, layers: int, normals: int) -> None:
+    def __init__(self, width: int, layers: int, normals: int, *, sees_capture: bool = False) -> None:
         super().__init__()
         self.observation = nn.Linear(6 + 2 * normals, width)
         self.pixel = nn.Linear(3 * normals + 1, width)
         self.layers = nn.ModuleList(_AttentionLayer(width) for _ in range(layers))
+        self.contexts = nn.ModuleList(ContextLayer(width) for _ in range(layers)) if sees_capture else None
         self.norm = nn.LayerNorm(width)
         self.weigh = zeroed(nn.Linear(width, 2))
 
     def forward(
-        self, observed: Tensor, lights: Tensor, residual: Tensor, valid: Tensor | None, normals: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the pixels' tokens (P, width) and the unit normals (P, 3) of least squares.
+        self,
+        observed: Tensor,
+        lights: Tensor,
+        residual: Tensor,
+        valid: Tensor | None,
+        normals: Tensor,
+        scale: Tensor,
+        *,
+        captures: int = 1,
+        context: CaptureContext | None = None,
+    ) -> tuple[Tensor, Tensor, CaptureContext | None]:
+        """Return the pixels' tokens (P, width), the unit normals (P, 3) of least squares, and the captures' context.
 
-        The observed values and residuals (P, F) of each pixel are scaled to a largest observation of 1. The lights (P,
-        F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals (P, K, 3) are
-        unit or zero.
+        The observed values and residuals (P, F) of each pixel are divided by its largest observation, `scale` (P, 1).
+        The lights (P, F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals
+        (P, K, 3) are unit or zero. Pixel p belongs to capture p % `captures`. Without a context, the pixels of each
+        capture see each other.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + DARKEST).log()
@@ -49,15 +63,25 @@ class SetBranch(nn.Module):
         mask = None
         if valid is not None:
             mask = torch.cat((valid.new_ones(len(valid), 1), valid), dim=1)[:, None, None]
-        for layer in self.layers:
+        if self.contexts is not None:
+            of_captures = scale.view(-1, captures).median(dim=0).values
+            brightness = of_captures if context is None else context.brightness
+            level = brightness_level(scale, brightness)
+        found: list[Summary] = []
+        for number, layer in enumerate(self.layers):
             tokens = layer(tokens, mask)
+            if self.contexts is not None:
+                known = None if context is None else context.layers[number]
+                pixel, summary = self.contexts[number](tokens[:, 0], level, captures, known)
+                tokens = torch.cat((pixel[:, None].to(tokens), tokens[:, 1:]), dim=1)
+                found.append(summary)
         tokens = self.norm(tokens)
         with torch.autocast(observed.device.type, enabled=False):
             log_weight, correction = self.weigh(tokens[:, 1:].to(self.weigh.weight.dtype)).unbind(-1)
             weight = log_weight.clamp(-10, 10).exp()
             weight = weight if valid is None else weight * valid
             fitted = _weighted_normals(observed + correction, lights, weight)
-        return tokens[:, 0], fitted
+        return tokens[:, 0], fitted, CaptureContext(brightness, tuple(found)) if found else None
 
 
 class _AttentionLayer(nn.Module):

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from splinecli.fits.lambertian import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
+from splinecli.networks.capture_context import CaptureContext
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
@@ -82,7 +83,8 @@ class SplineNet(nn.Module):
             self.ne_net = CompactNENet(config)
         self.set_branch: SetBranch | None = None
         if config.set_width:
-            self.set_branch = SetBranch(config.set_width, config.set_layers, 1 + len(config.fits))
+            fits = 1 + len(config.fits)
+            self.set_branch = SetBranch(config.set_width, config.set_layers, fits, sees_capture=config.sees_capture)
         self.refine_net = RefineNet() if config.refines else None
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
@@ -155,17 +157,22 @@ class SplineNet(nn.Module):
             dense = maps.lambertian_map + self.li_net(inputs)
         return dense * self.inside
 
-    def estimate(self, maps: PixelMaps, dense: Tensor | None) -> Estimate:
-        """Return the normals of NE-Net in the pixels' frames, and their errors."""
+    def estimate(
+        self, maps: PixelMaps, dense: Tensor | None, *, captures: int = 1, context: CaptureContext | None = None
+    ) -> Estimate:
+        """Return the normals of NE-Net in the pixels' frames, and their errors.
+
+        Pixel p belongs to capture p % `captures`. The context is that of `look_at`; without one, the pixels of each
+        capture see each other, if the network sees captures at all.
+        """
         interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
             raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
         else:
             channels = (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map)
-            normals = torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
-            features = None
+            normals, features = _starting_normals(maps), None
             if self.set_branch is not None:
-                features, fitted = self.set_branch(maps.observed, maps.lights, maps.residuals, maps.valid, normals)
+                features, fitted, _ = self._read_set(maps, normals, captures, context)
                 normals = torch.cat((normals, fitted[:, None]), dim=1)
             raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals, features)
         return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
@@ -176,17 +183,44 @@ class SplineNet(nn.Module):
         light_directions: Tensor,
         valid: Tensor | None = None,
         rotation: Rotation = NO_ROTATION,
+        context: CaptureContext | None = None,
     ) -> Estimate:
         """Return normals in the capture's frame, and their errors.
 
         The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
-        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. See build_maps for the others.
+        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context is that of `look_at`; without one, all
+        pixels see each other, if the network sees captures. See build_maps for the others.
         """
         # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
-        normals, error = self.estimate(maps, self.interpolate(maps))
+        normals, error = self.estimate(maps, self.interpolate(maps), context=context)
         return Estimate(to_capture_frame(normals, maps), error)
+
+    def look_at(self, observations: Tensor, light_directions: Tensor) -> CaptureContext | None:
+        """Return what a sample of a capture's pixels says about the others; None if the network sees no captures.
+
+        The observations (P, F) and the light directions are those of `forward`. Some SAMPLE pixels suffice.
+        """
+        if self.set_branch is None or not self.config.sees_capture:
+            return None
+        with torch.autocast(observations.device.type, enabled=False):
+            maps = self.build_maps(observations, light_directions)
+        return self._read_set(maps, _starting_normals(maps), 1, None)[2]
+
+    def _read_set(
+        self, maps: PixelMaps, normals: Tensor, captures: int, context: CaptureContext | None
+    ) -> tuple[Tensor, Tensor, CaptureContext | None]:
+        assert self.set_branch is not None
+        inputs = maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
+        found: tuple[Tensor, Tensor, CaptureContext | None] = self.set_branch(
+            *inputs, captures=captures, context=context
+        )
+        return found
+
+
+def _starting_normals(maps: PixelMaps) -> Tensor:
+    return torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
 
 
 def to_capture_frame(normals: Tensor, maps: PixelMaps) -> Tensor:

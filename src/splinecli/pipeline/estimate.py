@@ -20,7 +20,7 @@ from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
 from splinecli.errors import UsageError
 from splinecli.inference import NormalEstimate, estimate_normals, light_on
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
+from splinecli.methods.estimator import ConfidentEstimator, for_capture, tells_confidence
 from splinecli.methods.near_light import find_surface
 from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
 from splinecli.pipeline.observer import SILENT, Advance, Observer
@@ -53,10 +53,12 @@ def distil_for(
         return None, []
     from splinecli.methods.distilled import distil
 
+    light_of = partial(light_on, capture)
+    teacher = for_capture(estimator, light_of, capture.n_pixels)
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(estimator, partial(light_on, capture), capture.n_pixels, size, progress=advance)
+                distilled = distil(teacher, light_of, capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
             return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from splinecli.maths.observation_map import cell_directions, rotate_about_view_axis, sparse_map
 from splinecli.pixel_sets.store import Entry, PixelSet
-from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
+from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
+from splinecli.synthesis.whole_capture import photograph_captures
 
 # Memory-mapped arrays are closed after this many bytes of them were read, so that their pages can be freed.
 _MAPPED_BYTES = 128 << 20
@@ -67,7 +68,8 @@ def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
 class PixelSetSource:
     """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
 
-    The lights of a pixel are drawn within a cone; see choose_in_cone. Batches are on the device of the generator.
+    The lights of a pixel are drawn within a cone; see choose_in_cone. The pixels of a
+    capture, see CaptureConfig, are of one entry and have the same lights. Batches are on the device of the generator.
     """
 
     def __init__(
@@ -86,25 +88,39 @@ class PixelSetSource:
         """Draw a batch of P pixels."""
         truth = self._sample(pixels)
         counts = draw_light_counts(
-            pixels, self.config.min_lights, self.config.max_lights, self.config.usual_lights, self.generator
+            self.config.captures(pixels),
+            self.config.min_lights,
+            self.config.max_lights,
+            self.config.usual_lights,
+            self.generator,
         )
         order, valid = self._choose_lights(truth, counts)
         directions = truth.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
-        return photograph(truth, truth.radiance.gather(1, order), directions, valid, self.config, self.generator)
+        radiance = truth.radiance.gather(1, order)
+        return photograph_captures(truth, radiance, directions, valid, self.config, self.generator)
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return light indices (P, K) and which of them are used, counts (P,) in each row."""
-        rank = rank_in_cone(truth.light_directions, self.generator).masked_fill(~truth.known, torch.inf)
-        order = rank.argsort(dim=1)[:, : int(counts.max())]
+        """Return light indices (P, K) and which of them are used, from the number of each capture (G,)."""
+        captures = len(counts)
+        rank = rank_in_cone(truth.light_directions[:captures], self.generator)
+        order = rank.masked_fill(~truth.known[:captures], torch.inf).argsort(dim=1)[:, : int(counts.max())]
         chosen = torch.arange(order.shape[1], device=counts.device) < counts[:, None]
-        return order, chosen & truth.known.gather(1, order)
+        used = chosen & truth.known[:captures].gather(1, order)
+        size = len(truth.known) // captures
+        return order.repeat(size, 1), used.repeat(size, 1)
 
     def _sample(self, pixels: int) -> SampledPixels:
         """Draw pixels and read them with all their lights."""
-        device = self.generator.device
-        flat = torch.randint(int(self._ends[-1]), (pixels,), generator=self.generator, device=device).cpu()
+        device, shape = self.generator.device, (self.config.captures(pixels),)
+        size = pixels // shape[0]
+        flat = torch.randint(int(self._ends[-1]), shape, generator=self.generator, device=device).cpu()
         flat = flat.sort().values
         entry_of_pixel = torch.searchsorted(self._ends, flat, right=True)
+        if size > 1:  # An entry has the same probability as its pixels together.
+            entry_of_pixel = entry_of_pixel.repeat(size)
+            counts = torch.tensor([entry.n_pixels for entry in self.entries])[entry_of_pixel]
+            place = torch.rand(pixels, generator=self.generator, device=device, dtype=torch.float64).cpu()
+            flat = self._ends[entry_of_pixel] - counts + (place * counts).long()
         present = entry_of_pixel.bincount().nonzero().flatten().tolist()
         lights = max(self.entries[index].n_lights for index in present)
         radiance = np.zeros((pixels, lights), np.float32)

@@ -28,12 +28,18 @@ class CaptureConfig:
     min_lights: int = 4
     max_lights: int = 96
     usual_lights: int = 10
+    # most pixels of one capture, which share its lights, materials and faults. 1 draws each pixel on its own.
+    capture_pixels: int = 1
     light_direction_error_share: float = 0.5  # pixels with errors of the light directions
     light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities
     unequal_lights_share: float = 0.5  # pixels whose lights differ in intensity, which is divided out
     saturated_share: float = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
     sensor_noise: bool = True  # whether there are noise and quantisation
     eight_bit_share: float = 0.3  # pixels with 8 bits; the others have 10 to 16
+
+    def captures(self, pixels: int) -> int:
+        """Return the number G of captures in a draw of so many pixels. Pixel p belongs to capture p % G."""
+        return max(1, pixels // self.capture_pixels)
 
 
 class DenseMap(NamedTuple):
@@ -67,6 +73,7 @@ class PixelBatch:
     valid: Tensor  # (P, F) bool; false for padding
     truth: PixelTruth  # the normals and dense maps
     exposure: Tensor  # (P, 1), the factor from the radiance of the truth to the observations
+    captures: int  # number G of captures. Pixel p belongs to capture p % G
 
 
 def photograph(
@@ -77,7 +84,10 @@ def photograph(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph radiance (P, F) under directions (P, F, 3) with the faults of a camera and of a calibration."""
+    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with faults of its own.
+
+    These are the faults of a camera and of a calibration.
+    """
     intensities = draw_light_intensities(len(radiance), radiance.shape[1], config.unequal_lights_share, generator)
     radiance = radiance * valid
     exposure = draw_exposure(radiance * intensities, config.saturated_share, generator)
@@ -89,4 +99,4 @@ def photograph(
     observed = disturb_light_intensities(exposed * valid / intensities, config.light_intensity_error_share, generator)
     calibrated = disturb_light_directions(directions, config.light_direction_error_share, generator)
     restored = restore(observed, clipped & valid, calibrated, valid, generator)
-    return PixelBatch(restored, calibrated, valid, truth, exposure)
+    return PixelBatch(restored, calibrated, valid, truth, exposure, len(radiance))

@@ -77,9 +77,14 @@ class Wall:
 
 
 def draw_wall(
-    normals: Tensor, share: float, generator: torch.Generator, *, shadows: bool = True, interreflections: bool = True
+    normals: Tensor,
+    share: float | Tensor,
+    generator: torch.Generator,
+    *,
+    shadows: bool = True,
+    interreflections: bool = True,
 ) -> Wall:
-    """Draw walls for a share of the pixels with these normals (P, 3).
+    """Draw walls for a share of the pixels with these normals (P, 3); a tensor (P, 1) has a share for each.
 
     azimuth: within N(0, 50 degrees) of the normal's for 60 %, because a surface in a hollow faces a wall; else uniform.
     height: U(8, 75) degrees. half-width: tan U(15, 88) degrees. softness: U(0.01, 0.06).

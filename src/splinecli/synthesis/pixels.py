@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
-from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
+from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.effects import Wall, draw_ambient, draw_wall
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.synthesis.principled import PrincipledMaterial, choose, draw_material
+from splinecli.synthesis.random_numbers import draw_uniform
+from splinecli.synthesis.whole_capture import photograph_captures
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,23 @@ def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tenso
 
 
 def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
-    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials."""
+    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials.
+
+    Pixel p belongs to capture p % G, see CaptureConfig. The pixels of a capture share their materials, see
+    draw_shared_materials, and how many of them have walls: the usual share times U(0, 2).
+    """
     normals = draw_visible_normals(pixels, generator)
-    material = draw_material(pixels, generator)
+    hollow: float | Tensor = 1.0
+    if config.capture_pixels == 1:
+        material = draw_material(pixels, generator)
+    else:
+        captures = config.captures(pixels)
+        material = draw_shared_materials(pixels, captures, generator)
+        hollow = draw_uniform(generator, captures, 1, high=2.0).repeat(pixels // captures, 1)
     walls = tuple(
-        draw_wall(normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections)
+        draw_wall(
+            normals, hollow * share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
+        )
         for share in (config.wall_share, config.second_wall_share)
         if share > 0 and (config.cast_shadows or config.interreflections)
     )
@@ -113,6 +127,26 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     return PixelScene(normals, material, walls, ambient, mixed, weight)
 
 
+_MOST_MATERIALS = 8
+
+
+def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator) -> PrincipledMaterial:
+    """Draw the materials of some pixels; pixel p belongs to capture p % captures.
+
+    60 % of the captures have one material, the others 2 to 8. In half, these differ in their base alone, as on a
+    painted or printed object of one gloss.
+    """
+    drawn = draw_material(captures * _MOST_MATERIALS, generator)
+    count = 2 + ((_MOST_MATERIALS - 1) * draw_uniform(generator, captures)).long()
+    count[draw_uniform(generator, captures) < 0.6] = 1
+    size = pixels // captures
+    first = _MOST_MATERIALS * torch.arange(captures, device=count.device).repeat(size)
+    chosen = first + (count.repeat(size) * draw_uniform(generator, pixels)).long()
+    one_gloss = (draw_uniform(generator, captures, 1) < 0.5).repeat(size, 1)
+    material = drawn.take(chosen)
+    return choose(one_gloss, replace(drawn.take(first), base=material.base), material)
+
+
 class PixelGenerator:
     """Draws batches of pixels on the device of `generator`, reproducible from its seed."""
 
@@ -121,10 +155,12 @@ class PixelGenerator:
         self.generator = generator
 
     def draw(self, pixels: int) -> PixelBatch:
-        """Draw a batch of P pixels, each with its own rig. F is the largest number of lights."""
+        """Draw a batch of P pixels, a rig for each capture. F is the largest number of lights."""
         config, generator = self.config, self.generator
+        captures = config.captures(pixels)
+        size = pixels // captures
         scene = draw_scene(pixels, config, generator)
-        counts = draw_light_counts(pixels, config.min_lights, config.max_lights, config.usual_lights, generator)
-        true_directions = draw_light_directions(pixels, int(counts.max()), generator)
-        valid = torch.arange(true_directions.shape[1], device=counts.device) < counts[:, None]
-        return photograph(scene, scene.radiance(true_directions), true_directions, valid, config, generator)
+        counts = draw_light_counts(captures, config.min_lights, config.max_lights, config.usual_lights, generator)
+        directions = draw_light_directions(captures, int(counts.max()), generator).repeat(size, 1, 1)
+        valid = torch.arange(directions.shape[1], device=counts.device) < counts.repeat(size)[:, None]
+        return photograph_captures(scene, scene.radiance(directions), directions, valid, config, generator)

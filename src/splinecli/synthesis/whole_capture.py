@@ -1,4 +1,4 @@
-"""A rendered scene as one capture shows it: with what lies behind the object, and with faults that all pixels share."""
+"""Pixels as one capture shows them: with what lies behind the object, and with faults that all pixels share."""
 
 import math
 from functools import partial
@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from splinecli.capture.restore.saturation import restore_saturated
-from splinecli.synthesis.batches import CaptureConfig
+from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth, photograph
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.faults import (
     add_sensor_noise,
@@ -30,12 +30,43 @@ _MARGIN = 16  # most pixels that are added at each side of the object
 _WIDEST_RIM = 12  # most pixels by which a careless mask is too wide
 
 
+def photograph_captures(
+    truth: PixelTruth,
+    radiance: Tensor,
+    directions: Tensor,
+    valid: Tensor,
+    config: CaptureConfig,
+    generator: torch.Generator,
+) -> PixelBatch:
+    """Photograph pixels of the number G of captures that the configuration says; pixel p belongs to capture p % G.
+
+    See `photograph` for the arguments. The pixels of a capture have the same directions, and the valid ones come first.
+    """
+    if config.capture_pixels == 1:
+        return photograph(truth, radiance, directions, valid, config, generator)
+    captures = config.captures(len(radiance))
+    observations, calibrated = torch.zeros_like(radiance), directions.clone()
+    exposure = torch.ones_like(radiance[:, :1])
+    # The faults of a capture are drawn on the processor.
+    seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
+    own = torch.Generator().manual_seed(seed)
+    for capture in range(captures):
+        rows, lights = slice(capture, None, captures), slice(0, int(valid[capture].sum()))
+        seen, found, factor = photograph_scene(
+            radiance[rows, lights].cpu(), directions[capture, lights].cpu(), config, own
+        )
+        observations[rows, lights], calibrated[rows, lights] = seen.to(radiance), found.to(directions)
+        exposure[rows] = factor
+    return PixelBatch(observations, calibrated, valid, truth, exposure, captures)
+
+
 def photograph_scene(
     radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, float]:
     """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture shares.
 
-    Returns observations (P, F), divided by the intensities, and calibrated directions (F, 3). The functions of
+    Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
+    radiance to the observations. The functions of
     synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure places the 0.999
     quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of the observations
     are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a grain: each
@@ -51,7 +82,8 @@ def photograph_scene(
     saturated = uniform() < config.saturated_share
     share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
     bright = arriving.flatten().sort().values[-1 - math.floor(share * arriving.numel())].clamp(min=1e-6)
-    exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)).clamp(max=1)
+    exposure = float((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)
+    exposed = (arriving * exposure).clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
         grain = 10 ** uniform(-2.5, -1.2) * (uniform() < _GRAINY_SHARE)
@@ -68,7 +100,7 @@ def photograph_scene(
         values = observed.numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
         observed = torch.from_numpy(values)
-    return observed, calibrated
+    return observed, calibrated, exposure
 
 
 def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

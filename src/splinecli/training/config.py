@@ -78,6 +78,11 @@ class TrainingConfig:
                 f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards = {self.shards}"
             )
         lights = self.pixels
+        if (pixels := self.batch_size // self.shards) % lights.captures(pixels) and self.updates != "refine_net":
+            raise ModelError(
+                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards * capture_pixels ="
+                f" {self.shards * lights.capture_pixels}, or at most as many"
+            )
         if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
             raise ModelError(
                 f"training settings min_lights, usual_lights, max_lights are {lights.min_lights},"
@@ -129,7 +134,7 @@ class TrainingConfig:
 
 _LOWEST = {
     "batch_size": 1, "shards": 1, "steps": 1, "ne_net_updates": 1,
-    "min_lights": 3, "max_lights": 3, "usual_lights": 3,
+    "min_lights": 3, "max_lights": 3, "usual_lights": 3, "capture_pixels": 1,
 }  # fmt: skip
 
 _REMOVED = ("measured_share", "measured_materials")
@@ -177,10 +182,12 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.
 # Half of the paper's cells a side: the set branch has the exact directions that larger cells round.
-_COMPACT = NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64)
+_COMPACT = NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64, sees_capture=True)
 
 PRESETS = {
-    "compact": TrainingConfig(network=_COMPACT, batch_size=512, shards=2),
+    "compact": TrainingConfig(
+        network=_COMPACT, pixels=PixelGeneratorConfig(capture_pixels=64), batch_size=512, shards=2
+    ),
     "refine": TrainingConfig(
         network=replace(_COMPACT, error_head=True, refines=True),
         start_from="spline-net",

@@ -4,6 +4,7 @@ Every loss is the mean of one number for each pixel. The loss of a batch is ther
 parts of it. The paper does not say whether |.| sums or averages the cells of a map; here the argument `norm` does.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal, NamedTuple
@@ -20,6 +21,10 @@ from splinecli.training.config import Norm, TrainingConfig
 
 Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
+
+TYPICAL_ERROR = math.radians(2.5)
+"""Added to the error of a capture, whose root divides its loss. Without it, captures that are good already would count
+too much."""
 
 AXIS_LENGTH = 0.01
 """Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth."""
@@ -61,15 +66,15 @@ def compute_losses(
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks
-    are updated, the losses are added and the angle counts once. The loss of the error head is minus the log-likelihood
-    of the angle.
+    are updated, the losses are added and the angle counts once. Where pixels share captures, the angle is divided by
+    the root of the capture's error. The loss of the error head is minus the log-likelihood of the angle.
     """
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored))
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     if part == "error_head":
         with fixed(network, part), autocast:
-            normals, error = network.estimate(maps, network.interpolate(maps))
+            normals, error = network.estimate(maps, network.interpolate(maps), captures=batch.captures)
         assert error is not None, "TrainingConfig asks for an error head"
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
         return Losses(error_negative_log_likelihood(error, angle).mean(), angle.mean(), *[missing] * 4)
@@ -79,8 +84,9 @@ def compute_losses(
     with fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
             dense = network.interpolate(maps)
-        normals = network.estimate(maps, dense).normals
-    angle = angles(normals, normal_truth).mean()
+        normals = network.estimate(maps, dense, captures=batch.captures).normals
+    of_pixels = angles(normals, normal_truth)
+    angle = of_pixels.mean()
     on_map = masked = angle.new_full((), torch.nan)
     if dense is not None and dense_truth is not None:
         dense = dense.float()
@@ -89,7 +95,8 @@ def compute_losses(
     symmetric = asymmetric = angle.new_full((), torch.nan)
     if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
         symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
-    total = config.angle_weight * angle
+    shared = batch.captures < len(of_pixels)
+    total = config.angle_weight * (balanced(of_pixels.view(-1, batch.captures).mean(dim=0)) if shared else angle)
     if part != "ne_net" and dense is not None and dense_truth is not None:
         for weight, cells in ((config.map_weight, 1), (config.masked_weight, maps.occupied)):
             known = dense_truth.known * cells
@@ -164,6 +171,18 @@ def angles(normals: Tensor, truth: Tensor) -> Tensor:
     """
     sine = torch.linalg.cross(normals, truth).square().sum(-1).add(1e-12).sqrt()
     return torch.atan2(sine, (normals * truth).sum(-1))
+
+
+def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
+    """Return the mean error of captures (G,), each divided by the root of its reference: a degree counts more on a
+    capture that is nearly right.
+
+    Args:
+        error: in radians.
+        reference: errors (G,) that say how hard a capture is; None for the same.
+    """
+    reference = error.detach() if reference is None else reference
+    return (math.sqrt(2 * TYPICAL_ERROR) * error / (reference + TYPICAL_ERROR).sqrt()).mean()
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
+from splinecli.networks.capture_context import SAMPLE
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
@@ -23,7 +23,7 @@ from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.synthesis.whole_capture import add_background, photograph_scene
-from splinecli.training.objective import angles
+from splinecli.training.objective import angles, balanced
 
 FIRST_EXAMPLES = 64
 """Captures that are photographed before the first step."""
@@ -50,10 +50,6 @@ _ENGRAVED_SIZE = 96
 
 ERROR_WEIGHT = 0.05
 """Weight of the likelihood of the errors beside the angle in radians."""
-
-TYPICAL_ERROR = math.radians(2.5)
-"""Added to the error before refinement, whose root divides the angle of a capture. Without it, captures that are good
-already would count too much."""
 
 _BATCH = 1024
 
@@ -146,7 +142,7 @@ class ScenePool:
         if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
         radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-        observations, lights = photograph_scene(radiance, lights, self.config, generator)
+        observations, lights, _ = photograph_scene(radiance, lights, self.config, generator)
         features = pixel_features(self.network, observations, lights)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
@@ -197,10 +193,12 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     reference = brightness(observations)
     light_directions = light_directions.to(device)
     signs = alternating_signs(light_directions)
+    sample = torch.linspace(0, len(observations) - 1, min(len(observations), SAMPLE)).long()
+    context = network.look_at(observations[sample].to(device), light_directions)
     found = []
     for start in range(0, len(observations), _BATCH):
         batch = observations[start : start + _BATCH].to(device)
-        normals, error = network(batch, light_directions)
+        normals, error = network(batch, light_directions, context=context)
         assert error is not None, "TrainingConfig asks for an error head"
         found.append(refine_features(batch, light_directions, normals, error, reference, signs))
     return torch.cat(found)
@@ -261,6 +259,5 @@ def refinement_losses(network: SplineNet, maps: SceneMaps, *, bfloat16: bool = F
     angle = angles_of(normals)
     after = mean_over_capture(angle)
     surprise = mean_over_capture(error_negative_log_likelihood(error.movedim(1, -1), angle.detach()))
-    weight = math.sqrt(2 * TYPICAL_ERROR) / (before + TYPICAL_ERROR).sqrt()
-    total = (weight * after + ERROR_WEIGHT * surprise).mean()
+    total = balanced(after, before) + ERROR_WEIGHT * surprise.mean()
     return RefinementLosses(total, before.mean(), after.mean())

@@ -20,7 +20,7 @@ from splinecli.training.refinement import FIRST_EXAMPLES, STEPS_PER_EXAMPLE, Sce
 from splinecli.training.sources import Scenes, open_sets, pixel_source
 
 VALIDATION_PIXELS = 2048
-_VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
+_VALIDATION_DRAW = 64  # pixels at a time, if not a whole capture: a draw has one source
 VALIDATION_SCENES = 12
 SHOWN_PIXELS = 8
 
@@ -55,7 +55,7 @@ class PixelTask:
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         if rank == 0:
-            pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
+            pixels = min(max(_VALIDATION_DRAW, self.config.pixels.capture_pixels), VALIDATION_PIXELS)
             self.validation = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
 
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
@@ -137,7 +137,7 @@ def _estimate(
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
         dense = network.interpolate(maps)
-        normals = network.estimate(maps, dense).normals
+        normals = network.estimate(maps, dense, captures=batch.captures).normals
     return maps, dense, normals
 
 
