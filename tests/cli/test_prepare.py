@@ -146,8 +146,8 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
     arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
-    assert result.code == 0 and result.out.startswith("set: 6 entries of 2 scenes, ")
-    assert result.err.count(", 20 lights, rendered: ") == 6
+    assert result.code == 0 and result.out.startswith("set: 18 entries of 2 scenes, ")
+    assert result.err.count(", 20 lights, rendered: ") == 18
     for kind in ("diffuse", "specular", "metallic"):
         found = arrays(f"cube-{kind}")
         assert found["observations"].dtype == np.float16

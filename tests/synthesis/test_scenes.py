@@ -10,7 +10,15 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import CLASSES, draw_material, with_one_gloss
-from splinecli.synthesis.scenes import MIN_LIGHT_Z, SceneConfig, draw_lights, draw_patches, draw_scene, render_scene
+from splinecli.synthesis.scenes import (
+    MATERIALS,
+    MIN_LIGHT_Z,
+    SceneConfig,
+    draw_lights,
+    draw_patches,
+    draw_scene,
+    render_scene,
+)
 
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 
@@ -27,7 +35,7 @@ def tent() -> Mesh:
 def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
     scenes = [draw_scene(7, index, SMALL, tent()) for index in (0, 1, 0)]
     rendered = [render_scene(scene, SMALL) for scene in scenes]
-    for name in CLASSES:
+    for name in MATERIALS:
         assert np.array_equal(rendered[0].observations[name], rendered[2].observations[name])
         assert not np.array_equal(rendered[0].observations[name], rendered[1].observations[name])
     for other in (scenes[1], draw_scene(8, 0, SMALL, tent())):
@@ -40,13 +48,13 @@ def test_what_is_rendered() -> None:
     assert rendered.mask.shape == (16, 16)
     assert pixels == 256  # the slopes fill the frame
     assert rendered.normals.shape == (pixels, 3)
-    for observations in (rendered.observations[name] for name in CLASSES):
+    for observations in (rendered.observations[name] for name in MATERIALS):
         assert (observations.shape, observations.dtype) == ((pixels, 24), np.float32)
         assert np.isfinite(observations).all() and (observations >= 0).all()
     # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
     direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
     alone = render_scene(draw_scene(0, 2, direct, tent()), direct)
-    for name in CLASSES:
+    for name in MATERIALS:
         added = rendered.observations[name] - alone.observations[name]
         assert added.min() > -1e-6
         assert added.mean() > 0.01 * alone.observations[name].mean()

@@ -26,7 +26,7 @@ def prepare(
         None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
     ),
     n_lights: int | None = Option(
-        None, metavar="N", min=16, help="Number of lights of a rendered scene. [default: 500]"
+        None, metavar="N", min=16, help="Number of lights of a rendered scene. [default: 100]"
     ),
     seed: int = shared.SEED,
     workers: str = Option(

@@ -17,8 +17,7 @@ from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
-from splinecli.synthesis.principled import CLASSES
-from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, free_name, replacing
 
@@ -125,7 +124,7 @@ def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
     )
 
 
-RENDERER = 3  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
+RENDERER = 4  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
 
 # Meshes have random numbers of their own, so that a mesh changes no other scene.
 _FIRST_MESH_INDEX = 1_000_000
@@ -149,8 +148,8 @@ class ScenePlan:
         return (*names, *(f"scene{index:04}" for index in range(self.count)))
 
     def entry_names(self, position: int) -> dict[str, str]:
-        """Return the names of a scene's entries by class of material."""
-        return {kind: f"{self.names[position]}-{kind}" for kind in CLASSES}
+        """Return the names of a scene's entries by material."""
+        return {kind: f"{self.names[position]}-{kind}" for kind in MATERIALS}
 
     def recipe(self, position: int) -> dict[str, Any]:
         """Return the values that decide the content of a scene."""
@@ -186,7 +185,7 @@ class ScenePlan:
                     )
 
     def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
-        """Render a scene; return its shape in words, and the pixels by class of material.
+        """Render a scene; return its shape in words, and the pixels by material.
 
         `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or the
         camera sees nothing; UsageError if the packages of the extra `render` are not installed.
@@ -205,7 +204,7 @@ class ScenePlan:
         normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
         # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
         observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
-        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}
+        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
 
     def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
         """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
@@ -216,7 +215,7 @@ class ScenePlan:
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
     """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
-    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in CLASSES for name in ARRAYS}
+    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -224,4 +223,4 @@ def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
 def load_rendered(path: Path) -> dict[str, Pixels]:
     """Return the pixels in a file that save_rendered wrote. Raises OSError."""
     with np.load(path, allow_pickle=False) as arrays:
-        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in CLASSES}
+        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in MATERIALS}

@@ -1,7 +1,8 @@
 """Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018).
 
-A scene has one shape, three classes of materials that vary over its surface, and directional lights over the whole
-upper hemisphere. It depends only on (seed, index), so an interrupted set can be continued.
+A scene has one shape, three sets of materials of each of three classes, and directional lights over the whole upper
+hemisphere. Further materials take little time, because the paths of light are the same. It depends only on (seed,
+index), so an interrupted set can be continued.
 """
 
 from collections.abc import Callable
@@ -17,6 +18,9 @@ from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
+MATERIALS = {f"{name}{suffix}": kinds for suffix in ("", "-2", "-3") for name, kinds in CLASSES.items()}
+"""The sets of materials of a scene, and for each the range of the number that selects the kind; see draw_material."""
+
 MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewing direction
 
 
@@ -25,9 +29,9 @@ class SceneConfig:
     """Settings for drawing and rendering scenes."""
 
     size: int = 128  # width and height in pixels
-    lights: int = 500  # F, the number of lights
-    samples: int = 4  # k of the k x k samples per pixel
-    directions: int = 256  # number of paths per pixel for indirect light
+    lights: int = 100  # F, the number of lights
+    samples: int = 3  # k of the k x k samples per pixel
+    directions: int = 96  # number of paths per pixel for indirect light
     bounces: int = 4  # largest number of reflections before the visible surface; 0 for direct light only
 
 
@@ -38,7 +42,7 @@ class Scene:
     shape: str  # kind of the shape
     mesh: Mesh  # the shape
     lights: Floats  # (F, 3), unit directions towards the lights
-    materials: dict[str, PrincipledMaterial]  # by class, with one row per patch of the surface
+    materials: dict[str, PrincipledMaterial]  # those of MATERIALS, with one row per patch of the surface
     patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
     seed: int  # seed of the paths of indirect light
 
@@ -49,15 +53,16 @@ class RenderedScene:
 
     mask: NDArray[np.bool_]  # (H, W)
     normals: Floats  # (P, 3), unit; pixels row-major
-    observations: dict[str, Floats]  # by class, (P, F) float32; 1 is a matte white surface that faces the light
+    # those of MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light
+    observations: dict[str, Floats]
 
 
 def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:
     """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
 
-    The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
-    scenes the patches differ in their base alone, as on a painted or printed object of one gloss. Raises UsageError if
-    the extra `render` is not installed.
+    The surface has one patch in 60 % of the scenes, as real objects have one material or few, 2 to 12 in 25 %, and 20
+    to 3,000 in 15 %. In half of the scenes the patches differ in their base alone, as on a painted or printed object of
+    one gloss. Raises UsageError if the extra `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
@@ -66,9 +71,8 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     render_seed = int(rng.integers(2**62))
     materials: dict[str, PrincipledMaterial] = {}
-    for name in CLASSES:
-        torch.rand((), generator=generator)  # not used, but drawn by earlier versions, whose scenes stay the same
-        material = draw_material(patches, generator, CLASSES[name])
+    for name, kinds in MATERIALS.items():
+        material = draw_material(patches, generator, kinds)
         materials[name] = with_one_gloss(material) if one_gloss else material
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
@@ -130,6 +134,6 @@ def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[
 
 def _draw_patch_count(rng: np.random.Generator) -> int:
     kind = rng.random()
-    if kind < 0.7:
-        return int(rng.integers(1_000, 6_001))
-    return int(rng.integers(2, 41)) if kind < 0.9 else 1
+    if kind < 0.6:
+        return 1
+    return int(rng.integers(2, 13)) if kind < 0.85 else int(rng.integers(20, 3001))
