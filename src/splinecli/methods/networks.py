@@ -15,7 +15,7 @@ from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.observation_map import rotate_about_view_axis, sparse_map
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, directions_at
-from splinecli.networks.capture_context import SAMPLE, CaptureContext
+from splinecli.networks.capture_context import CaptureContext, sample_of
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement.refiner import NetworkRefiner
@@ -24,7 +24,6 @@ from splinecli.system.progress import Progress
 Precision = Literal["float32", "bfloat16"]
 
 _CANDIDATES = 4096  # pixels from which those are chosen that the others see
-_DARK_SHARE = 0.02  # of the brightest of them; darker ones, such as a black background, say nothing
 
 ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
@@ -86,10 +85,8 @@ class NetworkEstimator:
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self
-        light = light_of(_evenly(np.arange(n_pixels), _CANDIDATES))
-        brightest = light.observations.max(axis=1)
-        lit = np.flatnonzero(brightest >= _DARK_SHARE * np.quantile(brightest, 0.99))
-        rows = _evenly(lit, SAMPLE)
+        light = light_of(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
+        rows = sample_of(light.observations)
         sample, lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
             for values in (light.observations[rows], directions_at(light.directions, rows))
@@ -184,11 +181,6 @@ class NetworkEstimator:
 
         inside = network.inside.expand_as(dense)
         return known(maps.sparse, maps.occupied), known(dense, inside), known(every.values, every.occupied)
-
-
-def _evenly(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """Return at most so many of the rows, evenly spread."""
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.intp)]
 
 
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:

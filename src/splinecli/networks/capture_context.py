@@ -7,13 +7,17 @@ shows how much a network gains where pixels see each other. Here each pixel sees
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from splinecli.capture.robust_fit import lit_values
 from splinecli.networks.layers import zeroed
 
 SAMPLE = 256  # pixels of a capture that its other pixels see
 
+_DARK_SHARE = 0.02  # see lit_values. Darker pixels, such as a black background, say nothing
 _LARGEST_LOG = 7.0  # of a pixel's brightness over that of its capture
 _HEADS = 4
 
@@ -31,6 +35,14 @@ class CaptureContext(NamedTuple):
 
     brightness: Tensor  # (1,), median of the largest observation of the sampled pixels
     layers: tuple[Summary, ...]  # of the layers of the set branch
+
+
+def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Return the rows of the pixels, with observations (P, F), that the others see: at most SAMPLE lit ones, evenly
+    spread. Where none is lit, the first one stands for all.
+    """
+    rows, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
+    return rows if len(rows) else np.zeros(1, np.intp)
 
 
 def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:

@@ -64,8 +64,7 @@ class SetBranch(nn.Module):
         if valid is not None:
             mask = torch.cat((valid.new_ones(len(valid), 1), valid), dim=1)[:, None, None]
         if self.contexts is not None:
-            of_captures = scale.view(-1, captures).median(dim=0).values
-            brightness = of_captures if context is None else context.brightness
+            brightness = scale.view(-1, captures).median(dim=0).values if context is None else context.brightness
             level = brightness_level(scale, brightness)
         found: list[Summary] = []
         for number, layer in enumerate(self.layers):

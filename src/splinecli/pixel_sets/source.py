@@ -79,7 +79,8 @@ class PixelSetSource:
         self.entries = tuple(entries)
         self.config = config
         self.generator = generator
-        self._ends = torch.tensor([entry.n_pixels for entry in entries]).cumsum(0)
+        self._counts = torch.tensor([entry.n_pixels for entry in entries])
+        self._ends = self._counts.cumsum(0)
         self._observations: dict[int, NDArray[np.floating]] = {}
         self._normals_and_lights: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._bytes_read = 0
@@ -111,14 +112,13 @@ class PixelSetSource:
 
     def _sample(self, pixels: int) -> SampledPixels:
         """Draw pixels and read them with all their lights."""
-        device, shape = self.generator.device, (self.config.captures(pixels),)
-        size = pixels // shape[0]
-        flat = torch.randint(int(self._ends[-1]), shape, generator=self.generator, device=device).cpu()
+        device, captures = self.generator.device, self.config.captures(pixels)
+        flat = torch.randint(int(self._ends[-1]), (captures,), generator=self.generator, device=device).cpu()
         flat = flat.sort().values
         entry_of_pixel = torch.searchsorted(self._ends, flat, right=True)
-        if size > 1:  # An entry has the same probability as its pixels together.
-            entry_of_pixel = entry_of_pixel.repeat(size)
-            counts = torch.tensor([entry.n_pixels for entry in self.entries])[entry_of_pixel]
+        if captures < pixels:  # An entry has the same probability as its pixels together.
+            entry_of_pixel = entry_of_pixel.repeat(pixels // captures)
+            counts = self._counts[entry_of_pixel]
             place = torch.rand(pixels, generator=self.generator, device=device, dtype=torch.float64).cpu()
             flat = self._ends[entry_of_pixel] - counts + (place * counts).long()
         present = entry_of_pixel.bincount().nonzero().flatten().tolist()

@@ -28,7 +28,7 @@ class CaptureConfig:
     min_lights: int = 4
     max_lights: int = 96
     usual_lights: int = 10
-    # most pixels of one capture, which share its lights, materials and faults. 1 draws each pixel on its own.
+    # usual number of pixels of one capture, which share its lights, materials and faults. 1 draws each on its own.
     capture_pixels: int = 1
     light_direction_error_share: float = 0.5  # pixels with errors of the light directions
     light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities

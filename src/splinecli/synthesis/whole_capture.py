@@ -66,14 +66,15 @@ def photograph_scene(
     """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture shares.
 
     Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
-    radiance to the observations. The functions of
-    synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure places the 0.999
-    quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of the observations
-    are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a grain: each
-    observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where images are shifted by
-    a part of a pixel or light arrives from neighbours. Of the captures with errors of the intensities, 30 % have a
-    further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many degrees,
-    and their detail is still right.
+    radiance to the observations.
+
+    The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
+    places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
+    the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a
+    grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where images are
+    shifted by a part of a pixel or light arrives from neighbours. Of the captures with errors of the intensities, 30 %
+    have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many
+    degrees, and their detail is still right.
     """
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]

@@ -81,7 +81,7 @@ class TrainingConfig:
         if (pixels := self.batch_size // self.shards) % lights.captures(pixels) and self.updates != "refine_net":
             raise ModelError(
                 f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards * capture_pixels ="
-                f" {self.shards * lights.capture_pixels}, or at most as many"
+                f" {self.shards * lights.capture_pixels}, or fewer"
             )
         if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
             raise ModelError(

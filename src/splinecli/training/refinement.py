@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.networks.capture_context import SAMPLE
+from splinecli.networks.capture_context import sample_of
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
@@ -193,8 +193,8 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     reference = brightness(observations)
     light_directions = light_directions.to(device)
     signs = alternating_signs(light_directions)
-    sample = torch.linspace(0, len(observations) - 1, min(len(observations), SAMPLE)).long()
-    context = network.look_at(observations[sample].to(device), light_directions)
+    sample = observations[sample_of(observations.numpy())]
+    context = network.look_at(sample.to(device), light_directions)
     found = []
     for start in range(0, len(observations), _BATCH):
         batch = observations[start : start + _BATCH].to(device)
