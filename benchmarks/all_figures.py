@@ -213,7 +213,7 @@ class Bench:
             "eight-bits": {name: partial(self.eight_bits, convert, name) for name, convert in bits.items()},
             "photographs": {name: partial(self.photographs, name) for name in captures},
             "confidence": {name: partial(self.confidence, name) for name in captures},
-            "refined-lights": {m: partial(self.refined_lights, m) for m in ("iw12", "spline-net-pixelwise")},
+            "refined-lights": {m: partial(self.refined_lights, m) for m in ("iw12", *NETWORKS)},
             "distilled": {label: partial(self.distilled, label) for label in OBJECTS},
             "wrong-lights": each(self.wrong_lights, tables.WRONG_FILES),
             "near-lamps": each(self.near_lamps, tables.SCENES),

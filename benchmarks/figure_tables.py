@@ -106,7 +106,7 @@ TABLES = {
             "PX-Net": "PX-Net",
             "PS-Transformer": "PS-Transformer",
             "here: least squares (`ls`)": "ls",
-            "here: one pixel at a time (`spline-net-pixelwise`)": "spline-net-pixelwise",
+            "here: without refinement (`spline-net-pixelwise`)": "spline-net-pixelwise",
             "**here: `spline-net`, the default**": "spline-net",
         },
         {**{label: f"{label} 10" for label in OBJECTS}, "all ten objects": "all 10"},
@@ -129,7 +129,7 @@ TABLES = {
     "refined-lights": Table(
         ("refined-lights",),
         "sigma in degrees",
-        code(("iw12", "spline-net-pixelwise")),
+        code(("iw12", *NETWORKS)),
         {f"{deg:g}, {how}": f"{deg:g} {how}" for deg in (0, 4, 8) for how in ("given", "refined")},
     ),
     "eight-bits": Table(

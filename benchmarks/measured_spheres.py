@@ -1,6 +1,6 @@
 """Measure the error of weights on spheres of measured materials, which training has not seen.
 
-    python benchmarks/measured_spheres.py MATERIALS.npz LIGHTS.txt --weights spline-net [--draws 4] [--pixels 40]
+    python benchmarks/measured_spheres.py MATERIALS.npz LIGHTS.txt --weights spline-net [--draws 4] [--pixels 256]
 
 Each material gives a sphere under ten of the lights (seed 0), without shadows, noise and errors of calibration. Prints
 the mean angular error over all materials and pixels, and the materials with the largest errors.
@@ -21,7 +21,6 @@ from splinecli.networks.weights import resolve_weights
 from splinecli.synthesis.pixels import draw_visible_normals
 
 N_LIGHTS = 10
-_BATCH_PIXELS = 2048
 _IMPLAUSIBLE = ("black-obsidian", "brass", "chrome-steel", "grease-covered-steel", "ss440")
 """Mirrors, whose published networks reflect more than all light, are black, or are not reciprocal."""
 
@@ -89,7 +88,7 @@ def errors_deg(network: SplineNet, materials: Materials, lights: Tensor, draws: 
         drawn = lights[torch.randperm(len(lights), generator=generator)[:N_LIGHTS]]
         normals = draw_visible_normals(len(index), generator)
         found = []
-        for rows in torch.arange(len(index)).split(_BATCH_PIXELS):
+        for rows in torch.arange(len(index)).split(pixels):  # a capture each
             seen = normals[rows]
             radiance = materials.shade(index[rows], seen @ drawn.T, seen[:, 2:], drawn[:, 2])
             found.append(network(radiance, drawn).normals)
@@ -104,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("lights", type=Path, help="light directions, x y z a line")
     parser.add_argument("--weights", action="append", help="shipped name or file; may be repeated")
     parser.add_argument("--draws", type=int, default=4)
-    parser.add_argument("--pixels", type=int, default=40)
+    parser.add_argument("--pixels", type=int, default=256)
     options = parser.parse_args(arguments)
     materials = read_materials(options.materials)
     lights = torch.nn.functional.normalize(torch.from_numpy(np.loadtxt(options.lights)).float(), dim=-1)

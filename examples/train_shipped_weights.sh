@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about ten hours on two cores:
+# Train the weights that come with splinecli from scratch, in about twelve hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
@@ -22,7 +22,7 @@ run() {
   "$splinecli" train "$folder/$set" "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net-1 whole-scenes --preset compact --generator-weight 1.5 --steps 26800
+run spline-net-1 whole-scenes --preset compact --generator-weight 1.5 --steps 60000
 run spline-net-2 whole-scenes --preset compact --generator-weight 1.5 --steps 2600 --param learning_rate=1e-3 \
   --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
 run spline-net-3 whole-scenes --preset refine --steps 17500 --start-from "$folder/spline-net-2/weights.safetensors"

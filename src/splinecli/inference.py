@@ -136,6 +136,7 @@ def _estimate(
             indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
             if indirect is not None:
                 light_of = partial(light_on, capture, without=indirect)
+                estimator = for_capture(estimator, light_of, capture.n_pixels)
                 for rows in parts_of_rows(capture.n_pixels, tile_pixels):
                     changed = rows[indirect.counts_at(capture.observations[rows], rows)]
                     if len(changed):

@@ -16,6 +16,7 @@ from splinecli.synthesis.batches import CaptureConfig
 FAULTLESS = CaptureConfig(
     min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
     light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
+    ambient_share=0.0,
 )  # fmt: skip
 
 

@@ -148,7 +148,7 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
     assert stats.kstest(azimuth, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
 
 
-SHARED = replace(NOTHING, capture_pixels=16)
+SHARED = replace(NOTHING, capture_pixels=16, unequal_lights_share=0.0)
 
 
 def test_pixels_of_a_capture_share_its_lights_and_its_exposure() -> None:

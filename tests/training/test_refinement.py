@@ -25,7 +25,7 @@ from splinecli.training.tasks import RefinementTask
 CPU = torch.device("cpu")
 FLAWLESS = CaptureConfig(
     light_direction_error_share=0.0, light_intensity_error_share=0.0, unequal_lights_share=0.0,
-    saturated_share=0.0, sensor_noise=False,
+    saturated_share=0.0, sensor_noise=False, ambient_share=0.0,
 )  # fmt: skip
 
 
@@ -43,6 +43,18 @@ def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
     assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
     torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
     torch.testing.assert_close(calibrated, directions)
+
+
+def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
+    """It is between a share of the pixel's mean and of the capture's mean."""
+    radiance, directions = scene()
+    config = replace(FLAWLESS, ambient_share=1.0)
+    observations, _, exposure = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(4))
+    added = torch.where(observations < 1, observations / exposure - radiance, torch.nan)
+    assert added.nan_to_num(0).amax(1).sub(added.nan_to_num(9).amin(1)).max() < 1e-5
+    means = torch.stack((radiance.mean(dim=1), torch.full((len(radiance),), float(radiance.mean()))), dim=1)
+    shares = torch.linalg.lstsq(means, added.nanmean(1)).solution
+    assert shares.min() > 0 and 10**-3.2 < shares.sum() < 0.1
 
 
 def test_errors_of_calibration_are_those_of_the_capture() -> None:

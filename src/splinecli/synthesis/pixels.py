@@ -29,7 +29,6 @@ class PixelGeneratorConfig(CaptureConfig):
     interreflections: bool = True
     wall_share: float = 0.45
     second_wall_share: float = 0.2
-    ambient_share: float = 0.5
     mixed_share: float = 0.2
 
 
@@ -97,16 +96,19 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials.
 
     Pixel p belongs to capture p % G, see CaptureConfig. The pixels of a capture share their materials, see
-    draw_shared_materials, and how many of them have walls: the usual share times U(0, 2).
+    draw_shared_materials, and how many of them have walls: the usual share times U(-0.7, 2.3), none where that is
+    negative, as on convex objects.
     """
     normals = draw_visible_normals(pixels, generator)
     hollow: float | Tensor = 1.0
+    ambient_share = 0.0  # the pixels of a capture share their ambient light, see photograph_scene
     if config.capture_pixels == 1:
-        material = draw_material(pixels, generator)
+        material, ambient_share = draw_material(pixels, generator), config.ambient_share
     else:
         captures = config.captures(pixels)
         material = draw_shared_materials(pixels, captures, generator)
-        hollow = draw_uniform(generator, captures, 1, high=2.0).repeat(pixels // captures, 1)
+        hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)
+        hollow = hollow.repeat(pixels // captures, 1)
     walls = tuple(
         draw_wall(
             normals, hollow * share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
@@ -114,7 +116,7 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         for share in (config.wall_share, config.second_wall_share)
         if share > 0 and (config.cast_shadows or config.interreflections)
     )
-    ambient = draw_ambient(pixels, config.ambient_share, generator)
+    ambient = draw_ambient(pixels, ambient_share, generator)
     count = round(config.mixed_share * pixels)
     if not count:
         return PixelScene(normals, material, walls, ambient)

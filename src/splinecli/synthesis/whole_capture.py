@@ -1,6 +1,7 @@
 """Pixels as one capture shows them: with what lies behind the object, and with faults that all pixels share."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -68,6 +69,9 @@ def photograph_scene(
     Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
     radiance to the observations.
 
+    Under ambient light, all images show a share 10^U(-3.2, -1) of the mean of the pixel's radiance over the lights, as
+    from a room, and of the capture's mean, as by glare in the lens; see `_ambient`.
+
     The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
     the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a
@@ -79,7 +83,7 @@ def photograph_scene(
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
-    arriving = radiance * intensities
+    arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
     share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
     bright = arriving.flatten().sort().values[-1 - math.floor(share * arriving.numel())].clamp(min=1e-6)
@@ -102,6 +106,15 @@ def photograph_scene(
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
         observed = torch.from_numpy(values)
     return observed, calibrated, exposure
+
+
+def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:
+    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds of `photograph_scene`.
+
+    Light transport is linear, so the mean over the lights is what a room shows that is as bright on all sides.
+    """
+    level = 10 ** uniform(-3.2, -1.0) * (uniform() < share)
+    return level * torch.lerp(radiance.mean(dim=1, keepdim=True), radiance.mean(), uniform())
 
 
 def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
