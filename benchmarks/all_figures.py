@@ -3,9 +3,10 @@
     python benchmarks/all_figures.py DATA [--results runs/figures] [--only NAME ...] [--again]
 
 DATA has the folders DiLiGenT/pmsData, synth/L17, uw, psbox and merl_nbrdf. Everything together takes hours on two
-cores. Each row is stored in docs/figures.json when it is done, with the version and the weights; rows of the shipped
-weights are not measured again, and a stopped evaluation goes on in --results. --only names measurements, or a row of
-one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine.
+cores. Each row is stored in docs/figures.json when it is done, with the version and the weights. Rows of the shipped
+weights, and of methods without weights, are not measured again. A stopped evaluation goes on in --results. --only names
+measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a
+quiet machine.
 """
 
 import argparse
@@ -269,7 +270,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         used = None if name in WITHOUT_WEIGHTS else weights
         stored = measured.get(name, {})
         if options.again or stored.get("weights") != used:
-            stored = {}
+            # Fits do not depend on the weights.
+            kept = {} if options.again else stored.get("rows", {})
+            stored = {"rows": {row: cells for row, cells in kept.items() if row in FITS}}
         machine = options.machine if name in NEED_QUIET else ""
         measured[name] = {"version": __version__, "weights": used, "machine": machine, "rows": {}, **stored}
         for row, measure in measurements[name].items():

@@ -21,6 +21,7 @@ from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
+from splinecli.methods.networks import NetworkEstimator
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
 
@@ -170,3 +171,17 @@ def test_the_refinement_sees_what_is_left() -> None:
         estimate_normals(CAPTURE, make_estimator("spline-net"), stage=stage)
     assert np.abs(seen[0] - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
     assert stages == [["removing indirect light", len(BOWL)], ["refining", 0]]
+
+
+def test_the_capture_is_seen_anew_without_its_own_light() -> None:
+    seen = []
+
+    def for_capture(estimator: NetworkEstimator, light_of: LightOf, _: int) -> NetworkEstimator:
+        seen.append(light_of(EVERYWHERE).observations)
+        return estimator
+
+    with patch.object(NetworkEstimator, "for_capture", for_capture):
+        estimate_normals(CAPTURE, make_estimator("spline-net"))
+    before, after = seen[:2]
+    np.testing.assert_array_equal(before, CAPTURE.observations)
+    assert np.abs(after - DIRECT)[INSIDE].mean() < 0.3 * INDIRECT[INSIDE].mean()

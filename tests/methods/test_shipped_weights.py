@@ -13,6 +13,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import CONFIDENT_DEG
 from splinecli.networks.error_head import probability_within
+from splinecli.networks.spline_net import to_pixel_frame
 from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
@@ -48,11 +49,14 @@ def test_glossy_pixels_are_better_than_by_least_squares(n_lights):
 
 def test_confidence_on_generated_pixels():
     """Of all pixels with about the same confidence, that share is within the limit."""
-    config = PixelGeneratorConfig(min_lights=10, usual_lights=10, max_lights=10)
-    batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(3000)
+    config = PixelGeneratorConfig(min_lights=10, usual_lights=10, max_lights=10, capture_pixels=64)
+    batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(64 * 100)
+    network = resolve_weights("spline-net").network
     with torch.inference_mode():
-        normals, error = resolve_weights("spline-net").network(batch.observations, batch.light_directions, batch.valid)
-    error_deg = angle_between_deg(normals.numpy(), batch.truth.normals.numpy())
+        maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
+        normals, error = network.estimate(maps, network.interpolate(maps), captures=batch.captures)
+        truth = to_pixel_frame(batch.truth.normals, maps)
+    error_deg = angle_between_deg(normals.numpy(), truth.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()
     for fifth in np.array_split(confidence.argsort(), 5):
         assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(confidence[fifth].mean(), abs=0.06)
