@@ -22,7 +22,14 @@ from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
 from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, tells_confidence
+from splinecli.methods.estimator import (
+    TILE_PIXELS,
+    confidence,
+    for_capture,
+    refiner_of,
+    see_anew,
+    tells_confidence,
+)
 from splinecli.methods.near_light import find_surface
 from splinecli.system.memory import return_freed_memory
 from splinecli.system.progress import Progress
@@ -136,7 +143,8 @@ def _estimate(
             indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
             if indirect is not None:
                 light_of = partial(light_on, capture, without=indirect)
-                estimator = for_capture(estimator, light_of, capture.n_pixels)
+                # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
+                estimator = see_anew(estimator, light_of, capture.n_pixels)
                 for rows in parts_of_rows(capture.n_pixels, tile_pixels):
                     changed = rows[indirect.counts_at(capture.observations[rows], rows)]
                     if len(changed):

@@ -94,6 +94,22 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
     np.testing.assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
 
 
+@pytest.mark.parametrize("followed", [True, False])
+def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> None:
+    """The teacher says something else of the new observations. If that is noise, the teacher stays."""
+    normals, observations = glossy()
+    changed = observations**2
+    said = normals[:, [1, 0, 2]] if followed else noisy(normals, 40)
+    teacher = sure(np.concatenate((observations, changed)), np.concatenate((normals, said)), 1)
+    found = distil(teacher, distant(observations), 8000, SIZE)
+    anew = found.learn_anew(distant(changed), 8000)
+    assert angle_between_deg(anew.estimate_with_error(changed, LIGHTS)[0], said).mean() < 1
+    if followed:
+        assert isinstance(anew, DistilledEstimator) and anew.n_unlike < 1000
+    else:
+        assert anew is teacher
+
+
 def test_lamps_near_a_plane_of_bumps() -> None:
     """Lamps at two widths: their light turns by 25 degrees over the plane, which no single set of lights explains."""
     rng = np.random.default_rng(8)

@@ -23,6 +23,7 @@ from splinecli.methods.estimator import (
     Directions,
     Observations,
     directions_at,
+    for_capture,
     refiner_of,
 )
 from splinecli.methods.least_squares import TOWARDS_CAMERA
@@ -66,15 +67,32 @@ class DistilledEstimator:
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
-        self, teacher: ConfidentEstimator, perceptron: Perceptron, sample: PixelSample, found: Distillation
+        self,
+        teacher: ConfidentEstimator,
+        perceptron: Perceptron,
+        sample: PixelSample,
+        found: Distillation,
+        size: StudentSize,
     ) -> None:
-        self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
+        self._teacher, self._perceptron, self._sample, self._size = teacher, perceptron, sample, size
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
         self.refiner = refiner_of(teacher)
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
+
+    def learn_anew(self, light_of: LightOf, n_pixels: int) -> ConfidentEstimator:
+        """Learn the capture again, whose observations have changed. Return the network if it cannot be learned.
+
+        The arguments are those of `distil`.
+        """
+        teacher = for_capture(self._teacher, light_of, n_pixels)
+        try:
+            learned = distil(teacher, light_of, n_pixels, self._size)
+        except UsageError:  # too few pixels are still lit
+            return teacher
+        return learned if learned.distillation.is_good else teacher
 
     def report(self) -> dict[str, Any]:
         """Return how the capture was estimated so far, as JSON values."""
@@ -186,7 +204,7 @@ def distil(
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
     mean_deg, p95_deg = float(angles.mean()), float(np.quantile(angles, 0.95))
     found = Distillation(len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean()))
-    return DistilledEstimator(teacher, perceptron, sample, found)
+    return DistilledEstimator(teacher, perceptron, sample, found, size)
 
 
 def _inputs(

@@ -103,6 +103,18 @@ def for_capture(estimator: AnyEstimator, light_of: LightOf, n_pixels: int) -> An
     return found
 
 
+def see_anew(estimator: Estimator, light_of: LightOf, n_pixels: int) -> Estimator:
+    """Return an estimator of `for_capture` for the same capture with other observations; a distilled one learns again.
+
+    The arguments are those of `for_capture`.
+    """
+    learn_anew = getattr(estimator, "learn_anew", None)
+    if learn_anew is None:
+        return for_capture(estimator, light_of, n_pixels)
+    found: Estimator = learn_anew(light_of, n_pixels)
+    return found
+
+
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:
     """Return whether the estimator can estimate its own accuracy."""
     return isinstance(estimator, ConfidentEstimator) and estimator.tells_confidence

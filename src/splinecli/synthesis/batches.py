@@ -30,7 +30,7 @@ class CaptureConfig:
     usual_lights: int = 10
     # usual number of pixels of one capture, which share its lights, materials and faults. 1 draws each on its own.
     capture_pixels: int = 1
-    ambient_share: float = 0.5  # pixels under ambient light
+    ambient_share: float = 0.5  # captures under ambient light; generated pixels that are drawn one by one, too
     light_direction_error_share: float = 0.5  # pixels with errors of the light directions
     light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities
     unequal_lights_share: float = 0.5  # pixels whose lights differ in intensity, which is divided out

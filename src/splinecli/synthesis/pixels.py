@@ -100,11 +100,12 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     negative, as on convex objects.
     """
     normals = draw_visible_normals(pixels, generator)
-    hollow: float | Tensor = 1.0
-    ambient_share = 0.0  # the pixels of a capture share their ambient light, see photograph_scene
     if config.capture_pixels == 1:
-        material, ambient_share = draw_material(pixels, generator), config.ambient_share
+        material = draw_material(pixels, generator)
+        hollow: float | Tensor = 1.0
+        ambient_share = config.ambient_share
     else:
+        ambient_share = 0.0  # photograph_scene adds what the pixels of a capture share
         captures = config.captures(pixels)
         material = draw_shared_materials(pixels, captures, generator)
         hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)

@@ -111,7 +111,8 @@ def photograph_scene(
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:
     """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds of `photograph_scene`.
 
-    Light transport is linear, so the mean over the lights is what a room shows that is as bright on all sides.
+    Light transport is linear, so the mean over the lights is what a room shows that is as bright on all sides. It is
+    about half of the albedo, so the levels are those of draw_ambient in effects.py.
     """
     level = 10 ** uniform(-3.2, -1.0) * (uniform() < share)
     return level * torch.lerp(radiance.mean(dim=1, keepdim=True), radiance.mean(), uniform())
