@@ -4,9 +4,9 @@
 
 DATA has the folders DiLiGenT/pmsData, synth/L17, uw, psbox and merl_nbrdf. Everything together takes hours on two
 cores. Each row is stored in docs/figures.json when it is done, with the version and the weights. Rows of the shipped
-weights, and of methods without weights, are not measured again. A stopped evaluation goes on in --results. --only names
-measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a
-quiet machine.
+weights, and of fits, which earlier versions may have measured, are not measured again. A stopped evaluation goes on in
+--results. --only names measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named,
+because they need a quiet machine.
 """
 
 import argparse

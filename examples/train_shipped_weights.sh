@@ -22,8 +22,8 @@ run() {
   "$splinecli" train "$folder/$set" "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net-1 whole-scenes --preset compact --generator-weight 1.5 --steps 67000
-run spline-net-2 whole-scenes --preset compact --generator-weight 1.5 --steps 4000 --param learning_rate=1e-3 \
+run spline-net-1 whole-scenes --preset compact --generator-weight 0.7 --steps 67000
+run spline-net-2 whole-scenes --preset compact --generator-weight 0.7 --steps 4000 --param learning_rate=1e-3 \
   --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
 run spline-net-3 whole-scenes --preset refine --steps 26000 --start-from "$folder/spline-net-2/weights.safetensors"
 run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136

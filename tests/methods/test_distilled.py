@@ -100,10 +100,10 @@ def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> 
     normals, observations = glossy()
     changed = observations**2
     said = normals[:, [1, 0, 2]] if followed else noisy(normals, 40)
-    teacher = sure(np.concatenate((observations, changed)), np.concatenate((normals, said)), 1)
+    teacher = sure(np.concatenate((observations, changed)), np.concatenate((normals, said)), 4)
     found = distil(teacher, distant(observations), 8000, SIZE)
     anew = found.learn_anew(distant(changed), 8000)
-    assert angle_between_deg(anew.estimate_with_error(changed, LIGHTS)[0], said).mean() < 1
+    assert angle_between_deg(anew.estimate_with_error(changed, LIGHTS)[0], said).mean() < 3
     if followed:
         assert isinstance(anew, DistilledEstimator) and anew.n_unlike < 1000
     else:

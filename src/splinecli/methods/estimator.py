@@ -27,7 +27,9 @@ def directions_at(light_directions: Directions, rows: slice | NDArray[Any]) -> D
 
 
 class Estimator(Protocol):
-    """A method that estimates normals from observations, pixel by pixel.
+    """A method that estimates the normals of pixels from their observations.
+
+    Pixels may see others of their capture; see `for_capture`.
 
     name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it has none.
     device, precision: where and in which number format it computes; the report states both.

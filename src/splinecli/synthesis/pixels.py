@@ -1,8 +1,8 @@
 """The online pixel generator: it makes training pixels in batches, on the device of its random generator.
 
-Each pixel has its own normal, material, walls and ambient light, and gives its radiance under any light. A random
-rig gives the sparse observations, and the directions of all cells give the complete dense map. PX-Net (Logothetis et
-al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
+Each pixel has its own normal and walls, and a material of its own or of its capture. It gives its radiance under any
+light. A random rig gives the sparse observations, and the directions of all cells give the complete dense map. PX-Net
+(Logothetis et al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
 """
 
 from __future__ import annotations
