@@ -22,14 +22,7 @@ from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
 from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import (
-    TILE_PIXELS,
-    confidence,
-    for_capture,
-    refiner_of,
-    see_anew,
-    tells_confidence,
-)
+from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
 from splinecli.methods.near_light import find_surface
 from splinecli.system.memory import return_freed_memory
 from splinecli.system.progress import Progress

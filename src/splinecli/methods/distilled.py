@@ -83,7 +83,7 @@ class DistilledEstimator:
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
     def learn_anew(self, light_of: LightOf, n_pixels: int) -> ConfidentEstimator:
-        """Learn the capture again, whose observations have changed. Return the network if it cannot be learned.
+        """Learn the capture again after its observations changed. Return the network if it cannot be learned.
 
         The arguments are those of `distil`.
         """
