@@ -22,6 +22,7 @@ from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.maths.normals import angle_between_deg
+from splinecli.networks.capture_context import sample_of
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights
 
@@ -63,11 +64,9 @@ def estimate(
     network: SplineNet, observations: NDArray[np.float32], draw: Draw, valid: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
     """Return the errors (P,) in degrees."""
-    normals, _ = network(
-        torch.from_numpy(observations),
-        torch.from_numpy(draw.lights).float(),
-        None if valid is None else torch.from_numpy(valid),
-    )
+    seen, lights = torch.from_numpy(observations), torch.from_numpy(draw.lights).float()
+    context = network.look_at(seen[sample_of(observations)], lights)
+    normals, _ = network(seen, lights, None if valid is None else torch.from_numpy(valid), context=context)
     return angle_between_deg(normals.numpy(), draw.normals)
 
 

@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from scenes import directions_at
@@ -20,10 +21,12 @@ from splinecli.inference import estimate_normals
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
-from splinecli.methods import make_estimator
+from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.networks import NetworkEstimator
+from splinecli.networks.refine_channels import channels
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
+from splinecli.training.refinement import pixel_features
 
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)
@@ -185,3 +188,16 @@ def test_the_capture_is_seen_anew_without_its_own_light() -> None:
     before, after = seen
     np.testing.assert_array_equal(before, CAPTURE.observations)
     assert np.abs(after - DIRECT)[INSIDE].mean() < 0.3 * INDIRECT[INSIDE].mean()
+
+
+def test_the_refinement_net_learns_from_what_it_sees_in_use() -> None:
+    estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
+    features = pixel_features(
+        estimator.network, torch.from_numpy(CAPTURE.observations), torch.from_numpy(LIGHTS).float(), torch.tensor(MASK)
+    )
+    with patch.object(NetworkRefiner, "refine"):
+        in_use = estimate_normals(CAPTURE, estimator).normal_map[MASK]
+    learned_from = features[:, channels("normal")].numpy()
+    assert angle_between_deg(learned_from, in_use).max() < 0.1
+    with_indirect = estimator.estimate(CAPTURE.observations, LIGHTS)
+    assert angle_between_deg(learned_from, with_indirect).mean() > 1

@@ -50,11 +50,14 @@ def test_rotations_of_a_canonical_network() -> None:
         assert max(abs(turn) for turn, _ in several) <= 15
 
 
+SEES = {"map_size": 16, "set_width": 16, "set_layers": 1, "error_head": True, "sees_capture": True}
 PAPER = {"size": "paper", "map_size": 8}
-QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+QUARTER, MIRROR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.diag((1.0, -1, 1))
 
 
-@pytest.mark.parametrize(("settings", "turn", "symmetric_from"), [(PAPER, QUARTER, 4), ({}, np.diag((1.0, -1, 1)), 2)])
+@pytest.mark.parametrize(
+    ("settings", "turn", "symmetric_from"), [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)]
+)
 def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from) -> None:
     """Four make the paper's fourfold symmetric, for turned lights only change their order; two make ours a mirror."""
     observations, lights = pixels(4)
@@ -84,9 +87,6 @@ def test_networks_in_several_threads_count_apart() -> None:
     assert done[0] == done[1] == done[2]
 
 
-SEES = {"map_size": 16, "set_width": 16, "set_layers": 1, "error_head": True, "sees_capture": True}
-
-
 def light_of(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightOf:
     return lambda rows: LampLight(observations[rows], lights)
 
@@ -104,7 +104,7 @@ def test_pixels_see_their_capture_and_not_their_tile() -> None:
     assert angle_between_deg(network.estimate(observations, lights), expected).max() < 0.01
     assert angle_between_deg(network.estimate(observations[:30], lights), expected[:30]).max() > 0.1
     # The network that was given sees nothing of this capture.
-    assert whole is not network and network._context is None
+    assert whole is not network and network._contexts == [None]
 
 
 def test_a_black_background_says_nothing_of_the_object() -> None:

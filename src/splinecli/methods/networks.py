@@ -71,7 +71,7 @@ class NetworkEstimator:
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
-        self._context: CaptureContext | None = None
+        self._contexts: list[CaptureContext | None] = [None] * rotations  # as each rotation shows the capture
 
     @torch.no_grad()
     def for_capture(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
@@ -93,7 +93,7 @@ class NetworkEstimator:
         )
         found = copy.copy(self)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            found._context = self.network.look_at(sample, lights)
+            found._contexts = [self.network.look_at(sample, lights, rotation) for rotation in self._rotations]
         return found
 
     def estimate(
@@ -113,7 +113,7 @@ class NetworkEstimator:
 
         The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
-        if self._context is None and self.network.config.sees_capture and len(observations):
+        if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
             alone = self.for_capture(
                 lambda rows: LampLight(observations[rows], directions_at(light_directions, rows)), len(observations)
             )
@@ -134,8 +134,8 @@ class NetworkEstimator:
         """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""
         total = batch.new_zeros(len(batch), 5)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            for rotation in self._rotations:
-                normals, error = self.network(batch, lights, rotation=rotation, context=self._context)
+            for rotation, context in zip(self._rotations, self._contexts, strict=True):
+                normals, error = self.network(batch, lights, rotation=rotation, context=context)
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3:] += error

@@ -197,15 +197,18 @@ class SplineNet(nn.Module):
         normals, error = self.estimate(maps, self.interpolate(maps), context=context)
         return Estimate(to_capture_frame(normals, maps), error)
 
-    def look_at(self, observations: Tensor, light_directions: Tensor) -> CaptureContext | None:
+    def look_at(
+        self, observations: Tensor, light_directions: Tensor, rotation: Rotation = NO_ROTATION
+    ) -> CaptureContext | None:
         """Return what a sample of a capture's pixels says about the others; None if the network sees no captures.
 
-        The observations (P, F) and the light directions are those of `forward`. Some SAMPLE pixels suffice.
+        The observations (P, F), the light directions and the rotation are those of `forward`. Some SAMPLE pixels
+        suffice.
         """
         if self.set_branch is None or not self.config.sees_capture:
             return None
         with torch.autocast(observations.device.type, enabled=False):
-            maps = self.build_maps(observations, light_directions)
+            maps = self.build_maps(observations, light_directions, rotation=rotation)
         return self._read_set(maps, _starting_normals(maps), 1, None)[2]
 
     def _read_set(

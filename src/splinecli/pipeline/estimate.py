@@ -49,12 +49,12 @@ def distil_for(
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
-    if wanted is None and not _is_faster(capture, estimator, sizes[0]):
+    light_of = partial(light_on, capture)
+    teacher = for_capture(estimator, light_of, capture.n_pixels)
+    if wanted is None and not _is_faster(capture, teacher, sizes[0]):
         return None, []
     from splinecli.methods.distilled import distil
 
-    light_of = partial(light_on, capture)
-    teacher = for_capture(estimator, light_of, capture.n_pixels)
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:

@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
+from splinecli.light.indirect_light import find_indirect_light
+from splinecli.light.lamp_light import LampLight
 from splinecli.networks.capture_context import sample_of
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_channels import channels, split_features
@@ -143,7 +145,7 @@ class ScenePool:
             maps, mask = add_background(maps, mask, lights, generator)
         radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
         observations, lights, _ = photograph_scene(radiance, lights, self.config, generator)
-        features = pixel_features(self.network, observations, lights)
+        features = pixel_features(self.network, observations, lights, mask)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
@@ -186,22 +188,48 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
 
 
 @torch.no_grad()
-def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor) -> Tensor:
-    """Return the refinement net's features (P, CHANNELS) of a capture's pixels, after SPLINE-Net."""
+def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor) -> Tensor:
+    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W), after SPLINE-Net.
+
+    As in use, the network sees the observations (P, F) a second time where indirect light could be removed.
+    """
     device = network.cells.device
     network.eval()
-    reference = brightness(observations)
-    light_directions = light_directions.to(device)
-    signs = alternating_signs(light_directions)
+    lights = light_directions.to(device)
+    signs, reference = alternating_signs(lights), brightness(observations)
+    normals, errors = _estimate(network, observations, lights)
+    indirect = find_indirect_light(
+        mask.numpy(),
+        observations.numpy(),
+        lambda rows: LampLight(observations.numpy()[rows], light_directions.numpy()),
+        normals.cpu().numpy(),
+    )
+    if indirect is not None:
+        observations = torch.from_numpy(indirect.remove(observations.numpy(), np.arange(len(observations))))
+        normals, errors = _estimate(network, observations, lights)
+    found = [
+        refine_features(observations[part].to(device), lights, normals[part], errors[part], reference, signs)
+        for part in _batches(len(observations))
+    ]
+    return torch.cat(found)
+
+
+def _estimate(network: SplineNet, observations: Tensor, light_directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normals (P, 3) of a capture's pixels and the distributions (P, 2) of their errors."""
+    device = light_directions.device
     sample = observations[sample_of(observations.numpy())]
     context = network.look_at(sample.to(device), light_directions)
-    found = []
-    for start in range(0, len(observations), _BATCH):
-        batch = observations[start : start + _BATCH].to(device)
-        normals, error = network(batch, light_directions, context=context)
+    normals, errors = [], []
+    for part in _batches(len(observations)):
+        found, error = network(observations[part].to(device), light_directions, context=context)
         assert error is not None, "TrainingConfig asks for an error head"
-        found.append(refine_features(batch, light_directions, normals, error, reference, signs))
-    return torch.cat(found)
+        normals.append(found)
+        errors.append(error)
+    return torch.cat(normals), torch.cat(errors)
+
+
+def _batches(pixels: int) -> list[slice]:
+    return [slice(start, start + _BATCH) for start in range(0, pixels, _BATCH)]
 
 
 def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
