@@ -3,10 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
@@ -16,12 +15,13 @@ from splinecli.capture.linearise import StoredPixels, collect_observations, line
 from splinecli.capture.record import Capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Array, Doubles
 
 _KINDS = (np.uint8, np.uint16)
 
 
 def capture_from_arrays(
-    images: ArrayLike | Sequence[NDArray[Any]],
+    images: ArrayLike | Sequence[Array],
     light_directions: ArrayLike | None,
     mask: ArrayLike | None = None,
     *,
@@ -89,7 +89,7 @@ def capture_from_arrays(
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 
-def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
     stack = [np.asarray(image) for image in images]  # type: ignore[union-attr]
     if not stack:
         raise UsageError("found no images, expected (F, H, W) or (F, H, W, 3)")
@@ -105,7 +105,7 @@ def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[
     return stack
 
 
-def _checked_directions(directions: ArrayLike, n_lights: int) -> NDArray[np.float64]:
+def _checked_directions(directions: ArrayLike, n_lights: int) -> Doubles:
     vectors = np.asarray(directions, np.float64)
     if vectors.shape != (n_lights, 3):
         raise UsageError(
@@ -117,7 +117,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> NDArray[np.floa
     return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
 
 
-def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> NDArray[np.float64]:
+def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Doubles:
     """Return intensities (F, 3); ones where none are given."""
     if intensities is None:
         return np.ones((n_lights, 3))

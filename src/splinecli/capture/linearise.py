@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
@@ -19,6 +17,7 @@ from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
 BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
@@ -70,7 +69,7 @@ between v - 0.5 and v + 0.5, or between v and v + 1. A quarter of a step is half
 turns normals where a pixel is dark."""
 
 
-def linear_light(stored: NDArray[Any], path: Path, curve: TransferCurve = 1.0) -> NDArray[np.float32]:
+def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Singles:
     """Return stored values of any shape as linear light. Raises InputError as to_linear does."""
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
@@ -78,7 +77,7 @@ def linear_light(stored: NDArray[Any], path: Path, curve: TransferCurve = 1.0) -
     return linear
 
 
-def take_pixels(image: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+def take_pixels(image: Array, mask: Bools) -> Array:
     """Return image[mask], the pixels (P, C) of an image (H, W, C) in a mask (H, W), but faster."""
     if mask.all():
         return image.reshape(-1, image.shape[2])
@@ -88,9 +87,7 @@ def take_pixels(image: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
 class PixelReader:
     """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
 
-    def __init__(
-        self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int, window: Window = WHOLE
-    ) -> None:
+    def __init__(self, radiometry: RadiometricCalibration, mask: Bools, n_images: int, window: Window = WHOLE) -> None:
         """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
         self.radiometry = radiometry
         self.mask, self._window = mask, window
@@ -98,12 +95,12 @@ class PixelReader:
         if len(flats) not in (0, 1, n_images):
             problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
             raise InputError(problem, path=flats[0].parent)
-        self._ambient: NDArray[np.float32] | None = None
+        self._ambient: Singles | None = None
         if radiometry.ambient is not None:
             self._ambient = self._read(radiometry.ambient, "the other images")[1]
         self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
 
-    def read(self, path: Path, index: int, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    def read(self, path: Path, index: int, like: str) -> tuple[Array, Singles]:
         """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
 
         Messages name `like` as the image of the expected size.
@@ -115,14 +112,14 @@ class PixelReader:
             linear = linear / self._flat
         return stored, linear
 
-    def _read_flat(self, path: Path) -> NDArray[np.float32]:
+    def _read_flat(self, path: Path) -> Singles:
         _, linear = self._read(path, "the other images")
         mean = linear.mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
-    def _read(self, path: Path, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    def _read(self, path: Path, like: str) -> tuple[Array, Singles]:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(self._window.shape or self.mask.shape, like))
         stored = take_pixels(self._window.of(image), self.mask)
@@ -135,12 +132,12 @@ class StoredPixels:
     """The mask's pixels of one image."""
 
     path: Path  # the image; messages name it
-    values: NDArray[Any]  # (P, C), as stored
-    linear: NDArray[np.float32]  # (P, C) float32, linear light
-    intensity: NDArray[np.float64]  # (3,), RGB, of the light
+    values: Array  # (P, C), as stored
+    linear: Singles  # (P, C) float32, linear light
+    intensity: Doubles  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states; None where it states none
 
-    def observe(self) -> NDArray[np.float32]:
+    def observe(self) -> Singles:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
 
         A gray image is equal in all channels.
@@ -154,7 +151,7 @@ class StoredPixels:
         """Return what decides which pixels are saturated; see look_at. Raises InputError."""
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
-    def colours(self) -> NDArray[np.float32]:
+    def colours(self) -> Singles:
         """Return linear RGB (P, 3), each channel divided by its intensity."""
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
         colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
@@ -169,7 +166,7 @@ def collect_observations(
     *,
     white_level: float | None = None,
     progress: Callable[[], object] | None = None,
-) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
+) -> tuple[Singles, Saturation, list[CaptureWarning]]:
     """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
 
     Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where

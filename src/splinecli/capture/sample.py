@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Floats
 
 MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
@@ -20,17 +20,17 @@ class Sample:
     """Observations on a grid of pixels."""
 
     # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
-    observations: NDArray[np.floating]
-    mask: NDArray[np.bool_]  # (h, w) bool with p true pixels
+    observations: Floats
+    mask: Bools  # (h, w) bool with p true pixels
     step: int  # rows and columns of the images from one pixel of the grid to the next
 
 
-def grid_step(mask: NDArray[np.bool_]) -> int:
+def grid_step(mask: Bools) -> int:
     """Return the step with which a grid has at most about MAX_PIXELS pixels of the mask (H, W)."""
     return max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
 
 
-def sample_observations(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
+def sample_observations(observations: Floats, mask: Bools) -> Sample:
     """Return a sample of observations (P, F) of the pixels of a mask (H, W)."""
     step = grid_step(mask)
     if step == 1:
@@ -41,14 +41,14 @@ def sample_observations(observations: NDArray[np.floating], mask: NDArray[np.boo
     return Sample(observations[rows[rows >= 0]], rows >= 0, step)
 
 
-def closeup_window(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+def closeup_window(mask: Bools) -> tuple[slice, slice]:
     """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W) with pixels."""
     middles = (int(np.median(places)) for places in np.nonzero(mask))
     row, column = (max(0, middle - CLOSEUP_SIDE // 2) for middle in middles)
     return slice(row, row + CLOSEUP_SIDE), slice(column, column + CLOSEUP_SIDE)
 
 
-def take_closeup(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
+def take_closeup(observations: Floats, mask: Bools) -> Sample:
     """Return observations (P, F) of the pixels of a mask (H, W) in its closeup, every pixel."""
     window = closeup_window(mask)
     chosen = np.zeros_like(mask)

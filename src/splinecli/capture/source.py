@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.damage import stderr_is_apart
@@ -34,6 +33,7 @@ from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Doubles
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -46,12 +46,12 @@ class CaptureSource:
 
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
-    light_directions: NDArray[np.float64]  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: NDArray[np.float64]  # (F, 3), RGB; ones where no file gives them
+    light_directions: Doubles  # (F, 3), unit; x right, y up, z to the camera. See find_lights
+    light_intensities: Doubles  # (F, 3), RGB; ones where no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
     white_level: float | None = None  # stored value from which an observation counts as saturated; None to find it
-    automatic_mask: NDArray[np.bool_] | None = None  # (H, W), made from the images in place of a file; see find_mask
+    automatic_mask: Bools | None = None  # (H, W), made from the images in place of a file; see find_mask
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
@@ -141,7 +141,7 @@ class CaptureSource:
         except InputError as error:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
-    def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def read_mask(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of what is read of images of this shape. Raises InputError."""
         if self.automatic_mask is not None:
             return self.automatic_mask
@@ -162,7 +162,7 @@ class CaptureSource:
             raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
 
-    def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
+    def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
         """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
         size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
@@ -173,7 +173,7 @@ class CaptureSource:
         check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
 
-    def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
+    def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
         Raises InputError where a lamp would be inside the object.
@@ -185,9 +185,7 @@ class CaptureSource:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
-    def read_pixels(
-        self, mask: NDArray[np.bool_], indices: Sequence[int], use: Callable[[StoredPixels], Item]
-    ) -> Iterator[Item]:
+    def read_pixels(self, mask: Bools, indices: Sequence[int], use: Callable[[StoredPixels], Item]) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
         Raises InputError where an image cannot be read, or does not have the size of the mask.

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
@@ -16,6 +15,7 @@ from splinecli.capture.restore.white_level import Saturation, WhiteLevel
 from splinecli.capture.sample import Sample, closeup_window, grid_step
 from splinecli.capture.source import CaptureSource
 from splinecli.capture.window import WHOLE
+from splinecli.maths.arrays import Doubles
 
 DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
 FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
@@ -47,7 +47,7 @@ class CaptureSummary:
     lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
 
     @property
-    def axis_angles_deg(self) -> NDArray[np.float64]:
+    def axis_angles_deg(self) -> Doubles:
         """Angles (F,) between the lights and the camera axis."""
         return np.asarray(np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1))))
 
