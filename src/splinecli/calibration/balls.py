@@ -1,6 +1,6 @@
 """Light directions from folders of images of mirror balls."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
 from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
+from splinecli.capture.source import Progress
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
@@ -83,7 +84,7 @@ def calibrate_ball(
     *,
     circle: Circle | None = None,
     camera_matrix: Path | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Progress = lambda: None,
 ) -> BallCalibration:
     """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
@@ -119,8 +120,7 @@ def calibrate_ball(
         highlights.append(highlight)
         normals.append(normal[0])
         directions.append(direction[0])
-        if progress is not None:
-            progress()
+        progress()
     return BallCalibration(
         files, circle, circle_from, tuple(highlights), np.array(directions), np.array(normals), view, shape
     )

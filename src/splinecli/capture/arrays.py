@@ -17,8 +17,6 @@ from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.arrays import Array, Doubles
 
-_KINDS = (np.uint8, np.uint16)
-
 
 def capture_from_arrays(
     images: ArrayLike | Sequence[Array],
@@ -73,9 +71,7 @@ def capture_from_arrays(
             path = Path(f"images[{index}]")
             yield StoredPixels(path, values, linear_light(values, path), intensities[index])
 
-    observations, saturation, warnings = collect_observations(
-        pixels(), int(inside.sum()), n_lights, white_level=white_level
-    )
+    observations, saturation, warnings = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)
     indices, level = tuple(range(n_lights)), saturation.white_level
     capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
     known = light_intensities is not None
@@ -99,7 +95,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
             raise UsageError(f"found an image of shape {image.shape} at images[{index}], expected {first} as images[0]")
         if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
-        if image.dtype not in _KINDS and image.dtype.kind != "f":
+        if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
             problem = f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
             raise UsageError(problem, hint="Convert them with images.astype(...), without a change of scale")
     return stack

@@ -15,7 +15,7 @@ from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
-from splinecli.capture.window import WHOLE, Window
+from splinecli.capture.window import Window
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
@@ -84,47 +84,44 @@ def take_pixels(image: Array, mask: Bools) -> Array:
     return np.stack([image[..., channel][mask] for channel in range(image.shape[2])], axis=1)
 
 
-class PixelReader:
-    """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
+def pixel_reader(
+    radiometry: RadiometricCalibration, mask: Bools, n_images: int, like: str, window: Window
+) -> Callable[[Path, int], tuple[Array, Singles]]:
+    """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
 
-    def __init__(self, radiometry: RadiometricCalibration, mask: Bools, n_images: int, window: Window = WHOLE) -> None:
-        """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
-        self.radiometry = radiometry
-        self.mask, self._window = mask, window
-        flats = radiometry.flat_field
-        if len(flats) not in (0, 1, n_images):
-            problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
-            raise InputError(problem, path=flats[0].parent)
-        self._ambient: Singles | None = None
-        if radiometry.ambient is not None:
-            self._ambient = self._read(radiometry.ambient, "the other images")[1]
-        self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
+    The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
+    image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
+    """
+    flats = radiometry.flat_field
+    ambient: Singles | None = None
+    if len(flats) not in (0, 1, n_images):
+        problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+        raise InputError(problem, path=flats[0].parent)
 
-    def read(self, path: Path, index: int, like: str) -> tuple[Array, Singles]:
-        """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
+    def pixels(path: Path, like: str = "the other images") -> tuple[Array, Singles]:
+        """Return the pixels as stored, and linear without ambient light."""
+        image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
+        stored = take_pixels(window.of(image), mask)
+        linear = linear_light(stored, path, radiometry.curve)
+        return stored, linear if ambient is None else np.maximum(linear - ambient, 0)
 
-        Messages name `like` as the image of the expected size.
-        """
-        stored, linear = self._read(path, like)
-        if len(self.radiometry.flat_field) > 1:
-            linear = linear / self._read_flat(self.radiometry.flat_field[index])
-        elif self._flat is not None:
-            linear = linear / self._flat
-        return stored, linear
-
-    def _read_flat(self, path: Path) -> Singles:
-        _, linear = self._read(path, "the other images")
+    def falloff(path: Path) -> Singles:
+        _, linear = pixels(path)
         mean = linear.mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
-    def _read(self, path: Path, like: str) -> tuple[Array, Singles]:
-        """Return the pixels as stored, and linear without ambient light."""
-        image = decode_image(path, ExpectedSize(self._window.shape or self.mask.shape, like))
-        stored = take_pixels(self._window.of(image), self.mask)
-        linear = linear_light(stored, path, self.radiometry.curve)
-        return stored, linear if self._ambient is None else np.maximum(linear - self._ambient, 0)
+    if radiometry.ambient is not None:
+        ambient = pixels(radiometry.ambient)[1]
+    common = falloff(flats[0]) if len(flats) == 1 else None
+
+    def read(path: Path, index: int) -> tuple[Array, Singles]:
+        stored, linear = pixels(path, like)
+        flat = falloff(flats[index]) if len(flats) > 1 else common
+        return stored, linear if flat is None else linear / flat
+
+    return read
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +157,7 @@ class StoredPixels:
 
 
 def collect_observations(
-    images: Iterable[StoredPixels],
-    n_pixels: int,
-    n_images: int,
-    *,
-    white_level: float | None = None,
-    progress: Callable[[], object] | None = None,
+    images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None
 ) -> tuple[Singles, Saturation, list[CaptureWarning]]:
     """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
 
@@ -179,8 +171,6 @@ def collect_observations(
         found.append(image.find_saturated(white_level))
         observations[:, position] = image.observe()
         del image  # before the next one is decoded
-        if progress is not None:
-            progress()
     saturation = Saturation(n_pixels, tuple(found), white_level)
     warnings = codes.white_level(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)

@@ -149,7 +149,7 @@ def read_capture(
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
     light_indices: Sequence[int] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda: None,
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:

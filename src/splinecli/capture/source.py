@@ -23,10 +23,10 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import (
     AS_STORED,
-    PixelReader,
     RadiometricCalibration,
     StoredPixels,
     collect_observations,
+    pixel_reader,
 )
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
@@ -67,7 +67,7 @@ class CaptureSource:
         return len(self.light_directions)
 
     def read(
-        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None, *, as_stored: bool = False
+        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None, *, as_stored: bool = False
     ) -> Capture:
         """Return the capture under the chosen lights (None for all), in the order given.
 
@@ -88,7 +88,7 @@ class CaptureSource:
         return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
     def read_stored(
-        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None
+        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None
     ) -> StoredCapture:
         """Return the stored values under the chosen lights and the data needed to restore them; see read."""
         indices = (
@@ -99,10 +99,9 @@ class CaptureSource:
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
-        images = self.read_pixels(mask, indices, lambda pixels: pixels)
-        observations, saturation, warnings = collect_observations(
-            images, int(np.count_nonzero(mask)), len(indices), white_level=self.white_level, progress=progress
-        )
+        images = self.read_pixels(mask, indices, lambda pixels: pixels, progress)
+        n_pixels = int(np.count_nonzero(mask))
+        observations, saturation, warnings = collect_observations(images, n_pixels, len(indices), self.white_level)
         warnings = [*self.warnings, *warnings]
         if upside_down:
             text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
@@ -123,7 +122,7 @@ class CaptureSource:
         stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
-    def find_mask(self, progress: Progress | None = None) -> CaptureSource:
+    def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
         Raises InputError where no object stands out, or an image cannot be read.
@@ -132,10 +131,8 @@ class CaptureSource:
             return self
         everywhere = self.window.of(np.ones(common_size(self.facts)[0][:2], np.bool_))
         total = np.zeros(everywhere.size, np.float32)
-        for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours):
+        for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours, progress):
             total += colours.mean(axis=1)
-            if progress is not None:
-                progress()
         try:
             return replace(self, automatic_mask=find_object(total.reshape(everywhere.shape)))
         except InputError as error:
@@ -185,21 +182,28 @@ class CaptureSource:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
-    def read_pixels(self, mask: Bools, indices: Sequence[int], use: Callable[[StoredPixels], Item]) -> Iterator[Item]:
+    def read_pixels(
+        self,
+        mask: Bools,
+        indices: Sequence[int],
+        use: Callable[[StoredPixels], Item],
+        progress: Progress = lambda: None,
+    ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
         Raises InputError where an image cannot be read, or does not have the size of the mask.
         """
-        reader = PixelReader(self.radiometry, mask, len(self.facts), self.window)
         like = self.files.images[indices[0]].name
+        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window)
 
         def read(index: int) -> Item:
-            facts = self.facts[index]
-            stored, linear = reader.read(facts.path, index, like)
-            intensity = self.light_intensities[index]
-            return use(StoredPixels(facts.path, stored, linear, intensity, facts.white_level))
+            facts, intensity = self.facts[index], self.light_intensities[index]
+            return use(StoredPixels(facts.path, *pixels_of(facts.path, index), intensity, facts.white_level))
 
-        return read_ahead(read, indices)
+        for item in read_ahead(read, indices):
+            yield item
+            del item  # before the next one is decoded
+            progress()
 
 
 def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
