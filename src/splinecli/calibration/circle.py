@@ -13,6 +13,8 @@ from splinecli.errors import InputError
 from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 
 RAYS = 720
+_ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
+_RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
 MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
@@ -38,8 +40,7 @@ class Circle:
         """The points (N, 2) of the outline near the circle. A near camera sees an ellipse, which is no circle."""
         if self.points is not None:
             return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
-        angle = np.arange(RAYS) * (2 * np.pi / RAYS)
-        return np.column_stack((self.x + self.radius * np.cos(angle), self.y + self.radius * np.sin(angle)))
+        return (self.x, self.y) + self.radius * _RAYS
 
     def normals(self, x: Doubles, y: Doubles) -> Doubles:
         """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
@@ -131,15 +132,11 @@ def _merit(circle: Circle) -> float:
 def _refine(values: Singles, guess: Circle) -> Circle | None:
     """Return the circle through the strongest edges along rays from the guess's centre; None where too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
-        angle = np.arange(RAYS) * (2 * np.pi / RAYS)
         half = max(band * guess.radius, 3.0)
         steps = np.arange(guess.radius - half, guess.radius + half, 0.5)
-        x = guess.x + np.cos(angle)[:, None] * steps
-        y = guess.y + np.sin(angle)[:, None] * steps
-        sampled = cv2.remap(
-            values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-            borderValue=float("nan"),
-        )  # fmt: skip
+        places = (guess.x, guess.y) + _RAYS[:, None] * steps[:, None]
+        x, y = np.moveaxis(places.astype(np.float32), -1, 0)
+        sampled = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
         smooth = cv2.GaussianBlur(sampled, (9, 1), 2)
         edge = np.abs(smooth[:, 2:] - smooth[:, :-2])
         edge[~np.isfinite(edge)] = 0
@@ -151,7 +148,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
         clear = strength > _MIN_EDGE
         if clear.sum() < 0.2 * RAYS:
             return None
-        points = np.stack((guess.x + np.cos(angle) * reach, guess.y + np.sin(angle) * reach), axis=1)[clear]
+        points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
         guess = replace(_fit(points, outline_points=RAYS), points=points)
         if guess.visible < MIN_VISIBLE:
             return None

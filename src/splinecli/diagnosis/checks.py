@@ -10,7 +10,7 @@ from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
-from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
+from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
@@ -173,7 +173,7 @@ def _samples(capture: Capture) -> tuple[Sample, Sample]:
     if capture.estimated_intensities is not None:
         # They were estimated under the lights that are in question.
         sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
-    return sample, take_closeup(capture.observations, capture.mask)
+    return sample, sample_observations(capture.observations, capture.mask, closeup_of(capture.mask))
 
 
 def check_evidence(seen: Evidence) -> tuple[LightCheck | None, list[CaptureWarning]]:

@@ -141,7 +141,5 @@ def _inner(mask: Bools) -> Singles:
     """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
     import cv2
 
-    side = 2 * LARGEST + 1
-    padded = np.pad(mask.astype(np.uint8), LARGEST)
-    inner = cv2.erode(padded, np.ones((side, side), np.uint8))[LARGEST:-LARGEST, LARGEST:-LARGEST]
-    return inner.astype(np.float32)
+    shifts = np.ones((2 * LARGEST + 1, 2 * LARGEST + 1), np.uint8)
+    return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))

@@ -4,6 +4,7 @@ import numpy as np
 
 from splinecli.errors import printable
 from splinecli.maths.arrays import Doubles
+from splinecli.maths.normals import unit
 from splinecli.pictures.plotting import png_bytes
 
 _RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
@@ -38,8 +39,7 @@ def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | Non
 
 def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
     """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
-    across = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = unit(np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)]))
     turned = np.cross(directions, across)
     around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
     cosine, sine = np.cos(radii)[:, None, None], np.sin(radii)[:, None, None]

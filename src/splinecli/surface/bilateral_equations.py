@@ -23,6 +23,7 @@ far as the normal is contradicted, with r the larger residual of the two sides:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -156,18 +157,17 @@ class LaplacianSolver:
         that of the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
+        from scipy.sparse import csr_matrix
         from scipy.sparse.linalg import cg
 
-        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
+        damped = weights + _DAMPING_OF_GAPS
+        diagonal = self._sum(damped, self._near) + self._sum(damped, self._far) + _DAMPING_OF_HEIGHTS + pull
+        values = np.concatenate((-damped, -damped, diagonal))[self._pattern.data]
+        matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
-        steps = 0
-
-        def count(_: Doubles) -> None:
-            nonlocal steps
-            steps += 1
-
+        steps = count()
         change: Doubles
         change, _ = cg(
             matrix,
@@ -175,18 +175,11 @@ class LaplacianSolver:
             rtol=precision,
             maxiter=_MAX_STEPS,
             M=self._preconditioner,
-            callback=count,
+            callback=lambda _: next(steps),
         )
-        if steps > _STEPS_BEFORE_RENEWAL:
+        if next(steps) > _STEPS_BEFORE_RENEWAL:
             self._preconditioner = None
         return change
-
-    def _laplacian(self, weights: Doubles, pull: Doubles | float) -> Any:
-        from scipy.sparse import csr_matrix
-
-        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
-        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
-        return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 
     def _sum(self, of_pairs: Doubles, pixels: Pixels) -> Doubles:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)
