@@ -11,6 +11,7 @@ import numpy as np
 
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Array, Bools, Doubles, Singles
+from splinecli.maths.normals import unit
 
 RAYS = 720
 _ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
@@ -76,8 +77,7 @@ def circle_from_mask(mask: Bools) -> Circle:
         raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
     # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
-    from_centre = outline - (circle.x, circle.y)
-    outline = outline + 0.5 * from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
+    outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < MIN_VISIBLE:
         problem = f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball"

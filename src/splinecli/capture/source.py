@@ -91,9 +91,8 @@ class CaptureSource:
         self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None
     ) -> StoredCapture:
         """Return the stored values under the chosen lights and the data needed to restore them; see read."""
-        indices = (
-            tuple(range(self.n_lights)) if light_indices is None else check_light_indices(light_indices, self.n_lights)
-        )
+        everything = tuple(range(self.n_lights))
+        indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:

@@ -81,7 +81,7 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
 
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(vectors)
-    smooth = np.stack([gaussian_filter(normals[..., axis], SMOOTHING) for axis in range(3)], axis=2)
+    smooth = gaussian_filter(normals, (SMOOTHING, SMOOTHING, 0))
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
     return RoughNormals(smooth, mask, _outward(mask))
 

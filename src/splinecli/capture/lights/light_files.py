@@ -24,6 +24,7 @@ from splinecli.capture.lights.light_rows import (
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles
+from splinecli.maths.normals import unit
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
 _FILE = "a text file with a line {} for each image"
@@ -106,8 +107,7 @@ def unit_directions(
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # First divide by the largest component, because squares of very large or small ones leave float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    directions: Doubles = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
+    directions = unit(scaled)
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
