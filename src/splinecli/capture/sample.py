@@ -20,8 +20,7 @@ _SMALLEST_SIDE = 8
 class Sample:
     """Observations on a grid of pixels."""
 
-    # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
-    observations: Floats
+    observations: Floats  # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
     mask: Bools  # (h, w) bool with p true pixels
     step: int  # rows and columns of the images from one pixel of the grid to the next
 

@@ -34,8 +34,7 @@ class StoredCapture:
     capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
     saturation: Saturation
     intensities_known: bool  # whether a file, an option or the image format gives the light intensities
-    # (F,), those that were found together with the directions, or None
-    found_intensities: Doubles | None = None
+    found_intensities: Doubles | None = None  # (F,), those that were found together with the directions, or None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
         """Return the capture under lights that are found from these observations.
