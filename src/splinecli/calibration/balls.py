@@ -1,12 +1,11 @@
 """Light directions from folders of images of mirror balls."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
@@ -15,7 +14,9 @@ from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
 from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
+from splinecli.capture.source import Progress
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 
 REFERENCES = ("ref", "reference")
@@ -47,13 +48,13 @@ class BallCalibration:
     circle: Circle
     circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
     highlights: tuple[Highlight, ...]  # (F,), one for each image
-    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors; x right, y up, z to the camera
-    normals: NDArray[np.float64]  # (F, 3), of the ball at the highlights, half-way between the view and the lights
+    directions: Doubles  # (F, 3) float64, unit vectors; x right, y up, z to the camera
+    normals: Doubles  # (F, 3), of the ball at the highlights, half-way between the view and the lights
     view: View
     shape: tuple[int, ...]  # (H, W) of the images
 
     @property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Doubles:
         """The highlights (F, 2) in the image."""
         return np.array([(highlight.x, highlight.y) for highlight in self.highlights])
 
@@ -63,8 +64,8 @@ class CalibratedLights:
     """The light directions from one or several balls."""
 
     balls: tuple[BallCalibration, ...]
-    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors: the mean direction of the balls
-    disagreement_deg: NDArray[np.float64]  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
+    directions: Doubles  # (F, 3) float64, unit vectors: the mean direction of the balls
+    disagreement_deg: Doubles  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
@@ -83,7 +84,7 @@ def calibrate_ball(
     *,
     circle: Circle | None = None,
     camera_matrix: Path | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Progress = lambda: None,
 ) -> BallCalibration:
     """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
@@ -119,8 +120,7 @@ def calibrate_ball(
         highlights.append(highlight)
         normals.append(normal[0])
         directions.append(direction[0])
-        if progress is not None:
-            progress()
+        progress()
     return BallCalibration(
         files, circle, circle_from, tuple(highlights), np.array(directions), np.array(normals), view, shape
     )
@@ -161,8 +161,8 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     return circle, source
 
 
-def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
-    total: NDArray[np.float32] = read_image(images[0]).mean(axis=2)
+def _mean_gray(images: Sequence[Path]) -> Singles:
+    total: Singles = read_image(images[0]).mean(axis=2)
     expected = ExpectedSize(total.shape, images[0].name)
     for path in images[1:]:
         total = total + read_image(path, expected).mean(axis=2)

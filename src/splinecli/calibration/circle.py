@@ -5,15 +5,17 @@ Coordinates are in pixels of the image: x right, y down, whole numbers at pixel 
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Bools, Doubles, Singles
+from splinecli.maths.normals import unit
 
 RAYS = 720
+_ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
+_RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
 MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
@@ -32,23 +34,22 @@ class Circle:
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
     visible: float = 1.0  # share of the outline that the image or mask shows, 0 to 1
-    points: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
+    points: Doubles | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
 
     @property
-    def outline(self) -> NDArray[np.float64]:
+    def outline(self) -> Doubles:
         """The points (N, 2) of the outline near the circle. A near camera sees an ellipse, which is no circle."""
         if self.points is not None:
             return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
-        angle = np.arange(RAYS) * (2 * np.pi / RAYS)
-        return np.column_stack((self.x + self.radius * np.cos(angle), self.y + self.radius * np.sin(angle)))
+        return (self.x, self.y) + self.radius * _RAYS
 
-    def normals(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normals(self, x: Doubles, y: Doubles) -> Doubles:
         """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
             return np.stack((nx, ny, np.sqrt(1 - nx * nx - ny * ny)), axis=-1)
 
-    def inside(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def inside(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of the pixels inside the circle."""
         y, x = np.indices(shape[:2])
         return np.asarray((x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2)
@@ -61,7 +62,7 @@ class Circle:
         return across or self.y - reach < -0.5 or self.y + reach > height - 0.5
 
 
-def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
+def circle_from_mask(mask: Bools) -> Circle:
     """Return the circle through most of the outline of the largest part of a mask (H, W).
 
     Raises InputError if the outline is not that of a ball.
@@ -76,8 +77,7 @@ def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
         raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
     # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
-    from_centre = outline - (circle.x, circle.y)
-    outline = outline + 0.5 * from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
+    outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < MIN_VISIBLE:
         problem = f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball"
@@ -85,7 +85,7 @@ def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
     return circle
 
 
-def find_circle(image: NDArray[Any]) -> Circle:
+def find_circle(image: Array) -> Circle:
     """Return the clearest circle in a gray image (H, W), such as a ball on another background.
 
     Raises InputError if there is no clear circle.
@@ -129,18 +129,14 @@ def _merit(circle: Circle) -> float:
     return circle.visible * math.sqrt(circle.radius)
 
 
-def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
+def _refine(values: Singles, guess: Circle) -> Circle | None:
     """Return the circle through the strongest edges along rays from the guess's centre; None where too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
-        angle = np.arange(RAYS) * (2 * np.pi / RAYS)
         half = max(band * guess.radius, 3.0)
         steps = np.arange(guess.radius - half, guess.radius + half, 0.5)
-        x = guess.x + np.cos(angle)[:, None] * steps
-        y = guess.y + np.sin(angle)[:, None] * steps
-        sampled = cv2.remap(
-            values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-            borderValue=float("nan"),
-        )  # fmt: skip
+        places = (guess.x, guess.y) + _RAYS[:, None] * steps[:, None]
+        x, y = np.moveaxis(places.astype(np.float32), -1, 0)
+        sampled = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
         smooth = cv2.GaussianBlur(sampled, (9, 1), 2)
         edge = np.abs(smooth[:, 2:] - smooth[:, :-2])
         edge[~np.isfinite(edge)] = 0
@@ -152,14 +148,14 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
         clear = strength > _MIN_EDGE
         if clear.sum() < 0.2 * RAYS:
             return None
-        points = np.stack((guess.x + np.cos(angle) * reach, guess.y + np.sin(angle) * reach), axis=1)[clear]
+        points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
         guess = replace(_fit(points, outline_points=RAYS), points=points)
         if guess.visible < MIN_VISIBLE:
             return None
     return guess
 
 
-def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
+def _fit(points: Doubles, *, outline_points: int) -> Circle:
     """Return the circle that most points (N, 2) lie on; a complete outline would have `outline_points`.
 
     RANSAC with samples of three points, then least squares over the points close to the circle.
@@ -193,7 +189,7 @@ def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
     return Circle(x, y, radius, spread, min(1.0, float(close.sum() / outline_points)))
 
 
-def _through(three: NDArray[np.float64]) -> tuple[float, float, float] | None:
+def _through(three: Doubles) -> tuple[float, float, float] | None:
     """Return x, y and radius of the circle through three points (3, 2), or None where they are in line."""
     (ax, ay), (bx, by), (cx, cy) = three
     twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
@@ -204,6 +200,6 @@ def _through(three: NDArray[np.float64]) -> tuple[float, float, float] | None:
     return ax + x, ay + y, math.hypot(x, y)
 
 
-def _distance(points: NDArray[np.float64], circle: tuple[float, float, float]) -> NDArray[np.float64]:
+def _distance(points: Doubles, circle: tuple[float, float, float]) -> Doubles:
     x, y, radius = circle
     return np.asarray(np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius))

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
@@ -16,6 +15,7 @@ from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Doubles
 
 Target = Literal["ball", "card"]
 
@@ -27,12 +27,8 @@ _USED_RADIUS = 0.97  # of a ball: pixels at the rim mix it with the background
 
 
 def measure_light_intensities(
-    files: BallFiles,
-    light_directions: NDArray[np.float64],
-    target: Target,
-    *,
-    radiometry: RadiometricCalibration = AS_STORED,
-) -> NDArray[np.float64]:
+    files: BallFiles, light_directions: Doubles, target: Target, *, radiometry: RadiometricCalibration = AS_STORED
+) -> Doubles:
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
     By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
@@ -85,9 +81,7 @@ def measure_light_intensities(
     return np.asarray(intensities / intensities.mean())
 
 
-def _target_normals(
-    files: BallFiles, shape: tuple[int, ...], target: Target
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Doubles]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
     mask = np.ones(shape, np.bool_)
     if files.mask is not None:

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallCalibration
 from splinecli.calibration.mirror_ball import ball_centre, reflect
 from splinecli.calibration.view import View
+from splinecli.maths.arrays import Doubles
 from splinecli.surface.camera import focal_length, ray_basis
 
 LARGEST_UNCERTAINTY = 0.4
@@ -30,15 +30,13 @@ CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
 _DRAWS = 200
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
     """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
 
-    positions: Floats  # (F, 3)
-    uncertainty: Floats  # (F,), the distance within which the true position is with CONFIDENCE
+    positions: Doubles  # (F, 3)
+    uncertainty: Doubles  # (F,), the distance within which the true position is with CONFIDENCE
     pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel
     view: View
 
@@ -77,14 +75,14 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
 
 
 def _positions(
-    balls: Sequence[BallCalibration], matrix: Floats, diameter: float | None, errors: np.random.Generator | None = None
-) -> tuple[Floats, float, float]:
+    balls: Sequence[BallCalibration], matrix: Doubles, diameter: float | None, errors: np.random.Generator | None = None
+) -> tuple[Doubles, float, float]:
     """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
 
     `errors` draws errors of the pixels; None takes them as they are.
     """
 
-    def error(*shape: int) -> Floats:
+    def error(*shape: int) -> Doubles:
         return np.zeros(shape) if errors is None else errors.normal(size=shape)
 
     centres = np.array([ball_centre(ball.circle.outline + PIXEL_ERROR * error(2), matrix) for ball in balls])
@@ -108,7 +106,7 @@ def _positions(
     return points * unit, pixel * unit, miss
 
 
-def intersect_rays(starts: Floats, directions: Floats) -> tuple[Floats, float]:
+def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float]:
     """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays miss them.
 
     The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN gives NaN.

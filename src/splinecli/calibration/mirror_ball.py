@@ -6,18 +6,15 @@ unit of length is the radius of the ball. x is right, y up, z towards the camera
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.view import unit_rays
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Doubles
 from splinecli.surface.camera import ray_basis
-
-Floats = NDArray[np.float64]
 
 HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
 MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
@@ -33,7 +30,7 @@ class Highlight:
     saturated: float  # share of its pixels that is saturated, 0 to 1
 
 
-def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | None = None) -> Highlight:
+def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
     """Return the highlight of the lamp in the ball: the weighted centroid of its brightest patch.
 
     Args:
@@ -70,7 +67,7 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
 
 
-def ball_centre(outline: Floats, matrix: Floats) -> Floats:
+def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
     """Return the centre (3,) of a ball whose outline a camera sees at image points (N, 2).
 
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
@@ -89,7 +86,7 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
     return np.asarray(np.array((mx, my, -1 - beyond)) / np.sqrt(max(inverse, 1e-30)))
 
 
-def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doubles, Doubles]:
     """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
@@ -98,7 +95,7 @@ def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats,
     return normals, rays - 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
 
 
-def check_in_front(direction: Floats, ray: Floats) -> None:
+def check_in_front(direction: Doubles, ray: Doubles) -> None:
     """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
     if not direction @ ray < 0:
         problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"

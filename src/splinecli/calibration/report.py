@@ -3,10 +3,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.balls import CalibratedLights
 from splinecli.calibration.lamp_positions import LampPositions
+from splinecli.maths.arrays import Doubles
 from splinecli.maths.normals import angle_between_deg
 
 UNSURE_VISIBLE = 0.6  # smallest visible share of an outline without a warning
@@ -19,8 +19,8 @@ MISTAKEN_DEG = 3.0
 
 def calibration_report(
     lights: CalibratedLights,
-    intensities: NDArray[np.float64] | None,
-    known_directions: NDArray[np.float64] | None,
+    intensities: Doubles | None,
+    known_directions: Doubles | None,
     *,
     picture: str,
     lamps: LampPositions | None = None,
@@ -98,9 +98,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _warnings(
-    lights: CalibratedLights, known: NDArray[np.float64] | None, picture: str, lamps: LampPositions | None
-) -> list[str]:
+def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lamps: LampPositions | None) -> list[str]:
     warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain ({100 * ball.circle.visible:.0f} % of it visible,"
         f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
@@ -134,11 +132,11 @@ def _warnings(
     return warnings
 
 
-def _mean_and_largest(angles_deg: NDArray[np.float64], unit: str = "") -> dict[str, float]:
+def _mean_and_largest(angles_deg: Doubles, unit: str = "") -> dict[str, float]:
     return {f"mean{unit}": _round(angles_deg.mean()), f"largest{unit}": _round(angles_deg.max())}
 
 
-def _rows(values: NDArray[np.float64]) -> list[list[float]]:
+def _rows(values: Doubles) -> list[list[float]]:
     return [[_round(value, 6) for value in row] for row in values]
 
 

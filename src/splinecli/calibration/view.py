@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.lights.lamp_files import read_camera_matrix
+from splinecli.maths.arrays import Doubles
 from splinecli.maths.normals import unit
 from splinecli.surface.camera import ray_basis
-
-Floats = NDArray[np.float64]
 
 DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
 
@@ -33,7 +31,7 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 class View:
     """The camera of a calibration."""
 
-    matrix: Floats  # (3, 3) in pixels
+    matrix: Doubles  # (3, 3) in pixels
     source: str  # "--camera-matrix", "EXIF" or "assumed distant"
     shortest: float  # the focal length of the shortest usual lens, in pixels
 
@@ -41,7 +39,7 @@ class View:
     def known(self) -> bool:
         return self.source != "assumed distant"
 
-    def draw(self, generator: np.random.Generator) -> Floats:
+    def draw(self, generator: np.random.Generator) -> Doubles:
         """Return a matrix (3, 3) that may be the true one."""
         factor = 1.0
         if not self.known:
@@ -55,7 +53,7 @@ class View:
         return matrix
 
 
-def unit_rays(points: Floats, matrix: Floats) -> Floats:
+def unit_rays(points: Doubles, matrix: Doubles) -> Doubles:
     """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
     return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
 

@@ -3,10 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
@@ -16,12 +15,11 @@ from splinecli.capture.linearise import StoredPixels, collect_observations, line
 from splinecli.capture.record import Capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError, UsageError
-
-_KINDS = (np.uint8, np.uint16)
+from splinecli.maths.arrays import Array, Doubles
 
 
 def capture_from_arrays(
-    images: ArrayLike | Sequence[NDArray[Any]],
+    images: ArrayLike | Sequence[Array],
     light_directions: ArrayLike | None,
     mask: ArrayLike | None = None,
     *,
@@ -73,9 +71,7 @@ def capture_from_arrays(
             path = Path(f"images[{index}]")
             yield StoredPixels(path, values, linear_light(values, path), intensities[index])
 
-    observations, saturation, warnings = collect_observations(
-        pixels(), int(inside.sum()), n_lights, white_level=white_level
-    )
+    observations, saturation, warnings = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)
     indices, level = tuple(range(n_lights)), saturation.white_level
     capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
     known = light_intensities is not None
@@ -89,7 +85,7 @@ def capture_from_arrays(
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 
-def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
     stack = [np.asarray(image) for image in images]  # type: ignore[union-attr]
     if not stack:
         raise UsageError("found no images, expected (F, H, W) or (F, H, W, 3)")
@@ -99,13 +95,13 @@ def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[
             raise UsageError(f"found an image of shape {image.shape} at images[{index}], expected {first} as images[0]")
         if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
-        if image.dtype not in _KINDS and image.dtype.kind != "f":
+        if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
             problem = f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
             raise UsageError(problem, hint="Convert them with images.astype(...), without a change of scale")
     return stack
 
 
-def _checked_directions(directions: ArrayLike, n_lights: int) -> NDArray[np.float64]:
+def _checked_directions(directions: ArrayLike, n_lights: int) -> Doubles:
     vectors = np.asarray(directions, np.float64)
     if vectors.shape != (n_lights, 3):
         raise UsageError(
@@ -117,7 +113,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> NDArray[np.floa
     return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
 
 
-def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> NDArray[np.float64]:
+def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Doubles:
     """Return intensities (F, 3); ones where none are given."""
     if intensities is None:
         return np.ones((n_lights, 3))

@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splinecli.capture.restore.white_level import WhiteLevel
+from splinecli.maths.arrays import Doubles
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
     return [CaptureWarning(EIGHT_BIT, text)] if any_8_bit else []
 
 
-def estimated_lights(errors_deg: NDArray[np.float64]) -> CaptureWarning:
+def estimated_lights(errors_deg: Doubles) -> CaptureWarning:
     """Say that the light directions were found from the images, and with which expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,

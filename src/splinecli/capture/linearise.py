@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
@@ -17,8 +15,9 @@ from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
-from splinecli.capture.window import WHOLE, Window
+from splinecli.capture.window import Window
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
 BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
@@ -70,7 +69,7 @@ between v - 0.5 and v + 0.5, or between v and v + 1. A quarter of a step is half
 turns normals where a pixel is dark."""
 
 
-def linear_light(stored: NDArray[Any], path: Path, curve: TransferCurve = 1.0) -> NDArray[np.float32]:
+def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Singles:
     """Return stored values of any shape as linear light. Raises InputError as to_linear does."""
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
@@ -78,56 +77,51 @@ def linear_light(stored: NDArray[Any], path: Path, curve: TransferCurve = 1.0) -
     return linear
 
 
-def take_pixels(image: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+def take_pixels(image: Array, mask: Bools) -> Array:
     """Return image[mask], the pixels (P, C) of an image (H, W, C) in a mask (H, W), but faster."""
     if mask.all():
         return image.reshape(-1, image.shape[2])
     return np.stack([image[..., channel][mask] for channel in range(image.shape[2])], axis=1)
 
 
-class PixelReader:
-    """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
+def pixel_reader(
+    radiometry: RadiometricCalibration, mask: Bools, n_images: int, like: str, window: Window
+) -> Callable[[Path, int], tuple[Array, Singles]]:
+    """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
 
-    def __init__(
-        self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int, window: Window = WHOLE
-    ) -> None:
-        """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
-        self.radiometry = radiometry
-        self.mask, self._window = mask, window
-        flats = radiometry.flat_field
-        if len(flats) not in (0, 1, n_images):
-            problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
-            raise InputError(problem, path=flats[0].parent)
-        self._ambient: NDArray[np.float32] | None = None
-        if radiometry.ambient is not None:
-            self._ambient = self._read(radiometry.ambient, "the other images")[1]
-        self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
+    The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
+    image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
+    """
+    flats = radiometry.flat_field
+    ambient: Singles | None = None
+    if len(flats) not in (0, 1, n_images):
+        problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+        raise InputError(problem, path=flats[0].parent)
 
-    def read(self, path: Path, index: int, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
-        """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
+    def pixels(path: Path, like: str = "the other images") -> tuple[Array, Singles]:
+        """Return the pixels as stored, and linear without ambient light."""
+        image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
+        stored = take_pixels(window.of(image), mask)
+        linear = linear_light(stored, path, radiometry.curve)
+        return stored, linear if ambient is None else np.maximum(linear - ambient, 0)
 
-        Messages name `like` as the image of the expected size.
-        """
-        stored, linear = self._read(path, like)
-        if len(self.radiometry.flat_field) > 1:
-            linear = linear / self._read_flat(self.radiometry.flat_field[index])
-        elif self._flat is not None:
-            linear = linear / self._flat
-        return stored, linear
-
-    def _read_flat(self, path: Path) -> NDArray[np.float32]:
-        _, linear = self._read(path, "the other images")
+    def falloff(path: Path) -> Singles:
+        _, linear = pixels(path)
         mean = linear.mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
-    def _read(self, path: Path, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
-        """Return the pixels as stored, and linear without ambient light."""
-        image = decode_image(path, ExpectedSize(self._window.shape or self.mask.shape, like))
-        stored = take_pixels(self._window.of(image), self.mask)
-        linear = linear_light(stored, path, self.radiometry.curve)
-        return stored, linear if self._ambient is None else np.maximum(linear - self._ambient, 0)
+    if radiometry.ambient is not None:
+        ambient = pixels(radiometry.ambient)[1]
+    common = falloff(flats[0]) if len(flats) == 1 else None
+
+    def read(path: Path, index: int) -> tuple[Array, Singles]:
+        stored, linear = pixels(path, like)
+        flat = falloff(flats[index]) if len(flats) > 1 else common
+        return stored, linear if flat is None else linear / flat
+
+    return read
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +129,12 @@ class StoredPixels:
     """The mask's pixels of one image."""
 
     path: Path  # the image; messages name it
-    values: NDArray[Any]  # (P, C), as stored
-    linear: NDArray[np.float32]  # (P, C) float32, linear light
-    intensity: NDArray[np.float64]  # (3,), RGB, of the light
+    values: Array  # (P, C), as stored
+    linear: Singles  # (P, C) float32, linear light
+    intensity: Doubles  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states; None where it states none
 
-    def observe(self) -> NDArray[np.float32]:
+    def observe(self) -> Singles:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
 
         A gray image is equal in all channels.
@@ -154,7 +148,7 @@ class StoredPixels:
         """Return what decides which pixels are saturated; see look_at. Raises InputError."""
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
-    def colours(self) -> NDArray[np.float32]:
+    def colours(self) -> Singles:
         """Return linear RGB (P, 3), each channel divided by its intensity."""
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
         colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
@@ -163,13 +157,8 @@ class StoredPixels:
 
 
 def collect_observations(
-    images: Iterable[StoredPixels],
-    n_pixels: int,
-    n_images: int,
-    *,
-    white_level: float | None = None,
-    progress: Callable[[], object] | None = None,
-) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
+    images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None
+) -> tuple[Singles, Saturation, list[CaptureWarning]]:
     """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
 
     Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
@@ -182,8 +171,6 @@ def collect_observations(
         found.append(image.find_saturated(white_level))
         observations[:, position] = image.observe()
         del image  # before the next one is decoded
-        if progress is not None:
-            progress()
     saturation = Saturation(n_pixels, tuple(found), white_level)
     warnings = codes.white_level(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)

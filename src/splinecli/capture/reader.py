@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
@@ -30,6 +29,7 @@ from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture.stamp import stamp_files
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Doubles
 
 EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
 
@@ -149,7 +149,7 @@ def read_capture(
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
     light_indices: Sequence[int] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda: None,
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:
@@ -162,7 +162,7 @@ def read_capture(
 
 def _read_lights(
     files: CaptureFiles, frame: LightFrame, form: RowForm
-) -> tuple[CaptureFiles, NDArray[np.float64], NDArray[np.float64] | None, list[CaptureWarning]]:
+) -> tuple[CaptureFiles, Doubles, Doubles | None, list[CaptureWarning]]:
     """Return the files in the order of the lights, the directions (F, 3), their intensities (F, 3), and warnings."""
     path = files.light_directions
     if path is None:
@@ -192,7 +192,7 @@ def _read_lights(
 
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
-) -> tuple[tuple[Path, ...], NDArray[np.float64] | NamedLights]:
+) -> tuple[tuple[Path, ...], Doubles | NamedLights]:
     """Return the images that a light file is for, and its lights: all images, or else those of the usual size."""
     try:
         return images, read_lights(path, len(images), frame, form)
@@ -207,7 +207,7 @@ def _match_count(
         raise
 
 
-def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> NDArray[np.float64]:
+def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Doubles:
     """Return the intensities (F, 3) of images from a file with a line for each, or for each image of the folder."""
     if len(images) < len(in_folder):
         with suppress(InputError):  # the file is for the chosen images, or wrong in any case

@@ -5,15 +5,14 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
@@ -63,17 +62,17 @@ class Capture:
     """
 
     name: str
-    observations: NDArray[np.float32]
-    light_directions: NDArray[np.float64]
+    observations: Singles
+    light_directions: Doubles
     light_indices: tuple[int, ...]
-    mask: NDArray[np.bool_]
-    ground_truth: NDArray[np.float32] | None = None
+    mask: Bools
+    ground_truth: Singles | None = None
     warnings: tuple[CaptureWarning, ...] = ()
-    estimated_intensities: NDArray[np.float64] | None = None
-    restored: NDArray[np.bool_] | None = None
+    estimated_intensities: Doubles | None = None
+    restored: Bools | None = None
     white_level: WhiteLevel | None = None
     lamps: NearLamps | None = None
-    light_errors_deg: NDArray[np.float64] | None = None
+    light_errors_deg: Doubles | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -116,7 +115,7 @@ class Capture:
             light_errors_deg=None if self.light_errors_deg is None else self.light_errors_deg[chosen],
         )
 
-    def choose_pixels(self, positions: NDArray[np.integer]) -> Capture:
+    def choose_pixels(self, positions: Integers) -> Capture:
         """Return the same capture with some of its pixels, from their rising zero-based positions in this record."""
         mask = np.zeros_like(self.mask)
         # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
@@ -162,7 +161,7 @@ class Capture:
         if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
             raise InputError(f"{self.name}: an observation is not finite")
 
-    def _check_shape(self, what: str, array: NDArray[Any] | None, shape: tuple[int, ...], meaning: str = "") -> None:
+    def _check_shape(self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = "") -> None:
         if array is not None and array.shape != shape:
             raise InputError(f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}")
 
@@ -177,7 +176,7 @@ class Capture:
                 raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
 
 
-def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
+def in_one_plane(light_directions: Doubles) -> bool:
     """Return whether lights (F, 3) lie in one plane, so that Capture refuses them."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
     return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
@@ -200,6 +199,6 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
     return chosen
 
 
-def _blocks(rows: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+def _blocks(rows: Singles) -> Iterator[Singles]:
     for start in range(0, len(rows), _BLOCK):
         yield rows[start : start + _BLOCK]

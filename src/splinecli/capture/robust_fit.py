@@ -3,28 +3,29 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
 SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one count as shadow
 _PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
 _EQUAL_WEIGHT_BELOW = 0.02  # residuals far below this share of a pixel's largest observation have nearly equal weights
 
-Array = NDArray[np.floating]
 
-
-def shadow_weights(observations: Array) -> Array:
+def shadow_weights(observations: Floats) -> Floats:
     """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels whose largest observation is 1."""
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
-def shade(scaled_normals: Array, light_directions: Array) -> Array:
+def shade(scaled_normals: Floats, light_directions: Floats) -> Floats:
     """Return I = l . b (P, F) of scaled normals (P, 3) under lights (F, 3) or (P, F, 3)."""
     if light_directions.ndim == 2:
         return np.asarray(scaled_normals @ light_directions.T)
     return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
 
 
-def fit_scaled_normals(observations: Array, weights: Array, light_directions: Array, *, prior: float = _PRIOR) -> Array:
+def fit_scaled_normals(
+    observations: Floats, weights: Floats, light_directions: Floats, *, prior: float = _PRIOR
+) -> Floats:
     """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
 
     Args:
@@ -39,19 +40,19 @@ def fit_scaled_normals(observations: Array, weights: Array, light_directions: Ar
     return np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
 
 
-def _sum_over_lights(values: Array, terms: Array) -> Array:
+def _sum_over_lights(values: Floats, terms: Floats) -> Floats:
     """Return the sums (P, K) of values (P, F) times terms (F, K) or (P, F, K)."""
     return values @ terms if terms.ndim == 2 else (values[:, None] @ terms)[:, 0]
 
 
-def absolute_weights(residuals: Array) -> Array:
+def absolute_weights(residuals: Floats) -> Floats:
     """Return weights with which the next weighted least squares approximates least absolute deviations."""
     return np.asarray(1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW))
 
 
 def fit_robustly(
-    values: Array, lit: Array, lights: Array, fits: int, weights: Array | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    values: Floats, lit: Floats, lights: Floats, fits: int, weights: Floats | None = None
+) -> tuple[Doubles, Doubles]:
     """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
 
     Args:
@@ -68,7 +69,7 @@ def fit_robustly(
     return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
 
 
-def lit_values(observations: Array, dark_share: float, most: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Doubles]:
     """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
 
     Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.

@@ -1,12 +1,13 @@
 """A sample of a capture's pixels on a grid, small enough for checks that see neighbours."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Floats
 
 MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
@@ -19,41 +20,45 @@ _SMALLEST_SIDE = 8
 class Sample:
     """Observations on a grid of pixels."""
 
-    # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
-    observations: NDArray[np.floating]
-    mask: NDArray[np.bool_]  # (h, w) bool with p true pixels
+    observations: Floats  # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
+    mask: Bools  # (h, w) bool with p true pixels
     step: int  # rows and columns of the images from one pixel of the grid to the next
 
 
-def grid_step(mask: NDArray[np.bool_]) -> int:
-    """Return the step with which a grid has at most about MAX_PIXELS pixels of the mask (H, W)."""
-    return max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
+Part = tuple[slice, slice]  # rows and columns of the images
 
 
-def sample_observations(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
-    """Return a sample of observations (P, F) of the pixels of a mask (H, W)."""
-    step = grid_step(mask)
-    if step == 1:
-        return Sample(observations, mask, step)
-    rows = np.full(mask.shape, -1)
-    rows[mask] = np.arange(len(observations))
-    rows = rows[::step, ::step]
-    return Sample(observations[rows[rows >= 0]], rows >= 0, step)
+def grid_of(mask: Bools) -> Part:
+    """Return the rows and columns of a grid with at most about MAX_PIXELS pixels of the mask (H, W)."""
+    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
+    return slice(None, None, step), slice(None, None, step)
 
 
-def closeup_window(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+def closeup_of(mask: Bools) -> Part:
     """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W) with pixels."""
     middles = (int(np.median(places)) for places in np.nonzero(mask))
     row, column = (max(0, middle - CLOSEUP_SIDE // 2) for middle in middles)
     return slice(row, row + CLOSEUP_SIDE), slice(column, column + CLOSEUP_SIDE)
 
 
-def take_closeup(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
-    """Return observations (P, F) of the pixels of a mask (H, W) in its closeup, every pixel."""
-    window = closeup_window(mask)
+def pixels_of(parts: Iterable[Part], mask: Bools) -> Bools:
+    """Return the pixels of a mask (H, W) that are in one of the parts."""
     chosen = np.zeros_like(mask)
-    chosen[window] = True
-    return Sample(observations[chosen[mask]], mask[window], 1)
+    for part in parts:
+        chosen[part] = mask[part]
+    return chosen
+
+
+def sample_observations(
+    observations: Floats, mask: Bools, part: Part | None = None, known: Bools | None = None
+) -> Sample:
+    """Return the sample of a mask (H, W) in a part of the images; None for its grid.
+
+    Observations (P, F) are those of the mask, or of those of its pixels that are `known`: at least those of the part.
+    """
+    part = part or grid_of(mask)
+    chosen = pixels_of([part], mask)
+    return Sample(observations[chosen[mask if known is None else known]], mask[part], part[0].step or 1)
 
 
 def leave_out_background(sample: Sample) -> tuple[Sample, float]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.damage import stderr_is_apart
@@ -24,16 +23,17 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import (
     AS_STORED,
-    PixelReader,
     RadiometricCalibration,
     StoredPixels,
     collect_observations,
+    pixel_reader,
 )
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Doubles
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -46,12 +46,12 @@ class CaptureSource:
 
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
-    light_directions: NDArray[np.float64]  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: NDArray[np.float64]  # (F, 3), RGB; ones where no file gives them
+    light_directions: Doubles  # (F, 3), unit; x right, y up, z to the camera. See find_lights
+    light_intensities: Doubles  # (F, 3), RGB; ones where no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
     white_level: float | None = None  # stored value from which an observation counts as saturated; None to find it
-    automatic_mask: NDArray[np.bool_] | None = None  # (H, W), made from the images in place of a file; see find_mask
+    automatic_mask: Bools | None = None  # (H, W), made from the images in place of a file; see find_mask
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
@@ -67,7 +67,7 @@ class CaptureSource:
         return len(self.light_directions)
 
     def read(
-        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None, *, as_stored: bool = False
+        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None, *, as_stored: bool = False
     ) -> Capture:
         """Return the capture under the chosen lights (None for all), in the order given.
 
@@ -88,21 +88,19 @@ class CaptureSource:
         return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
     def read_stored(
-        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None
+        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None
     ) -> StoredCapture:
         """Return the stored values under the chosen lights and the data needed to restore them; see read."""
-        indices = (
-            tuple(range(self.n_lights)) if light_indices is None else check_light_indices(light_indices, self.n_lights)
-        )
+        everything = tuple(range(self.n_lights))
+        indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
-        images = self.read_pixels(mask, indices, lambda pixels: pixels)
-        observations, saturation, warnings = collect_observations(
-            images, int(np.count_nonzero(mask)), len(indices), white_level=self.white_level, progress=progress
-        )
+        images = self.read_pixels(mask, indices, lambda pixels: pixels, progress)
+        n_pixels = int(np.count_nonzero(mask))
+        observations, saturation, warnings = collect_observations(images, n_pixels, len(indices), self.white_level)
         warnings = [*self.warnings, *warnings]
         if upside_down:
             text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
@@ -123,7 +121,7 @@ class CaptureSource:
         stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
-    def find_mask(self, progress: Progress | None = None) -> CaptureSource:
+    def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
         Raises InputError where no object stands out, or an image cannot be read.
@@ -132,16 +130,14 @@ class CaptureSource:
             return self
         everywhere = self.window.of(np.ones(common_size(self.facts)[0][:2], np.bool_))
         total = np.zeros(everywhere.size, np.float32)
-        for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours):
+        for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours, progress):
             total += colours.mean(axis=1)
-            if progress is not None:
-                progress()
         try:
             return replace(self, automatic_mask=find_object(total.reshape(everywhere.shape)))
         except InputError as error:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
-    def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def read_mask(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of what is read of images of this shape. Raises InputError."""
         if self.automatic_mask is not None:
             return self.automatic_mask
@@ -162,7 +158,7 @@ class CaptureSource:
             raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
 
-    def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
+    def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
         """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
         size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
@@ -173,7 +169,7 @@ class CaptureSource:
         check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
 
-    def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
+    def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
         Raises InputError where a lamp would be inside the object.
@@ -186,22 +182,27 @@ class CaptureSource:
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
     def read_pixels(
-        self, mask: NDArray[np.bool_], indices: Sequence[int], use: Callable[[StoredPixels], Item]
+        self,
+        mask: Bools,
+        indices: Sequence[int],
+        use: Callable[[StoredPixels], Item],
+        progress: Progress = lambda: None,
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
         Raises InputError where an image cannot be read, or does not have the size of the mask.
         """
-        reader = PixelReader(self.radiometry, mask, len(self.facts), self.window)
         like = self.files.images[indices[0]].name
+        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window)
 
         def read(index: int) -> Item:
-            facts = self.facts[index]
-            stored, linear = reader.read(facts.path, index, like)
-            intensity = self.light_intensities[index]
-            return use(StoredPixels(facts.path, stored, linear, intensity, facts.white_level))
+            facts, intensity = self.facts[index], self.light_intensities[index]
+            return use(StoredPixels(facts.path, *pixels_of(facts.path, index), intensity, facts.white_level))
 
-        return read_ahead(read, indices)
+        for item in read_ahead(read, indices):
+            yield item
+            del item  # before the next one is decoded
+            progress()
 
 
 def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.capture.lights.found_lights import LightFinder
@@ -15,6 +14,7 @@ from splinecli.capture.restore.light_intensities import estimate_light_intensiti
 from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.capture.restore.white_level import Saturation
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles, Integers
 
 
 def name_reading(*, as_stored: bool) -> str:
@@ -34,8 +34,7 @@ class StoredCapture:
     capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
     saturation: Saturation
     intensities_known: bool  # whether a file, an option or the image format gives the light intensities
-    # (F,), those that were found together with the directions, or None
-    found_intensities: NDArray[np.float64] | None = None
+    found_intensities: Doubles | None = None  # (F,), those that were found together with the directions, or None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
         """Return the capture under lights that are found from these observations.
@@ -59,17 +58,17 @@ class StoredCapture:
         found = None if self.found_intensities is None else self.found_intensities[list(positions)]
         return replace(self, capture=capture, saturation=saturation, found_intensities=found)
 
-    def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
+    def choose_pixels(self, rows: Integers) -> StoredCapture:
         """Return the capture with these rising rows of its observations, with arrays of its own."""
         return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
-    def estimate_intensities(self) -> NDArray[np.float64] | None:
+    def estimate_intensities(self) -> Doubles | None:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
         return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
 
-    def restore(self, intensities: NDArray[np.float64] | None) -> Capture:
+    def restore(self, intensities: Doubles | None) -> Capture:
         """Return the capture with its intensities divided out and its saturated observations restored.
 
         The observations are changed in place: this record must not be used afterwards.
@@ -90,7 +89,7 @@ class StoredCapture:
             return self.capture
         return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)
 
-    def _lights_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
+    def _lights_of(self, rows: Integers) -> Doubles:
         """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near lamps on a plane."""
         lamps = self.capture.lamps
         if lamps is None:

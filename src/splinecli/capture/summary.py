@@ -1,11 +1,9 @@
 """Summary of a capture without normals: sizes, exposure and lights."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
@@ -13,9 +11,10 @@ from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import AS_STORED, StoredPixels
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import Saturation, WhiteLevel
-from splinecli.capture.sample import Sample, closeup_window, grid_step
-from splinecli.capture.source import CaptureSource
+from splinecli.capture.sample import Sample, closeup_of, grid_of, pixels_of, sample_observations
+from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture.window import WHOLE
+from splinecli.maths.arrays import Doubles
 
 DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
 FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
@@ -47,7 +46,7 @@ class CaptureSummary:
     lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
 
     @property
-    def axis_angles_deg(self) -> NDArray[np.float64]:
+    def axis_angles_deg(self) -> Doubles:
         """Angles (F,) between the lights and the camera axis."""
         return np.asarray(np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1))))
 
@@ -85,7 +84,7 @@ class CaptureSummary:
         return found
 
 
-def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
+def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
     Raises InputError where an image cannot be read or does not fit, or a lamp would be inside the object.
@@ -94,35 +93,27 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
     shape = sizes[0]
     mask = source.read_mask(shape)
     n_pixels = int(np.count_nonzero(mask))
-    step = grid_step(mask)
-    on_grid, inside = np.zeros_like(mask), np.zeros_like(mask)
-    on_grid[::step, ::step] = mask[::step, ::step]
-    seen_closely = closeup_window(mask)
-    inside[seen_closely] = mask[seen_closely]
-    taken = on_grid | inside
+    parts = grid_of(mask), closeup_of(mask)
+    taken = pixels_of(parts, mask)
     fitting = [index for index, size in enumerate(sizes) if size == shape]
     observations = np.zeros((int(np.count_nonzero(taken)), len(fitting)), np.float32)
     found, images = [], {}
-    for position, pixels in enumerate(source.read_pixels(mask, fitting, lambda pixels: pixels)):
+    for position, pixels in enumerate(source.read_pixels(mask, fitting, lambda pixels: pixels, progress)):
         found.append(pixels.find_saturated(source.white_level))
         observations[:, position] = replace(pixels, linear=pixels.linear[taken[mask]]).observe()
         images[fitting[position]] = _summarise(pixels, shape)
-        if progress is not None:
-            progress()
     as_stored = replace(source, radiometry=AS_STORED, window=WHOLE)
     for index, size in enumerate(sizes):
         if size != shape:
-            (pixels,) = as_stored.read_pixels(np.ones(size, np.bool_), [index], lambda pixels: pixels)
+            (pixels,) = as_stored.read_pixels(np.ones(size, np.bool_), [index], lambda pixels: pixels, progress)
             images[index] = _summarise(pixels, size)
-            if progress is not None:
-                progress()
     saturation = Saturation(n_pixels, tuple(found), source.white_level)
     for index, n_saturated in zip(fitting, saturation.n_saturated.tolist(), strict=True):
         images[index] = replace(images[index], saturated=n_saturated / max(n_pixels, 1))
     level, samples = saturation.white_level, None
     if len(fitting) == len(sizes):
-        sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
-        samples = sample, Sample(observations[inside[taken]], mask[seen_closely], 1)
+        sample, close = (sample_observations(observations, mask, part, taken) for part in parts)
+        samples = sample, close
     relative = tuple(_relative_to(level, images[index]) for index in range(len(sizes)))
     return CaptureSummary(source, relative, n_pixels, level, samples, source.near_lamps(mask)[1])
 

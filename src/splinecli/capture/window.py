@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Bools, Doubles, Floats
 
 Numbers = TypeVar("Numbers", bound=np.generic)
 
@@ -44,19 +45,19 @@ class Window:
         left, top, width, height = self.box or (0, 0, pixels.shape[1], pixels.shape[0])
         return pixels[top : top + height : self.step, left : left + width : self.step]
 
-    def whole(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def whole(self, mask: Bools) -> Bools:
         """Return the mask of whole images from a mask of what is read."""
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         self.of(whole)[...] = mask
         return whole
 
-    def camera(self, matrix: NDArray[np.floating]) -> NDArray[np.float64]:
+    def camera(self, matrix: Floats) -> Doubles:
         """Return the camera matrix (3, 3) of what is read, from that of whole images."""
         left, top, *_ = self.box or (0, 0)
         to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
         return np.asarray(to_window @ matrix, np.float64)
 
-    def filled(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def filled(self, mask: Bools) -> Bools:
         """Return the mask of whole images from a mask of what is read. A pixel stands for those left out beside it."""
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         part = replace(self, step=1).of(whole)

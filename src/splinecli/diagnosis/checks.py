@@ -4,18 +4,18 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
-from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
+from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
 
 SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
@@ -173,7 +173,7 @@ def _samples(capture: Capture) -> tuple[Sample, Sample]:
     if capture.estimated_intensities is not None:
         # They were estimated under the lights that are in question.
         sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
-    return sample, take_closeup(capture.observations, capture.mask)
+    return sample, sample_observations(capture.observations, capture.mask, closeup_of(capture.mask))
 
 
 def check_evidence(seen: Evidence) -> tuple[LightCheck | None, list[CaptureWarning]]:
@@ -189,7 +189,7 @@ def check_evidence(seen: Evidence) -> tuple[LightCheck | None, list[CaptureWarni
     return None if seen.found else seen.light_check, warnings
 
 
-def light_spread(light_directions: NDArray[np.float64]) -> tuple[float, bool]:
+def light_spread(light_directions: Doubles) -> tuple[float, bool]:
     """Return how well lights (F, 3) determine a normal, and whether they lie in a cone rather than near a plane.
 
     The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation
@@ -199,7 +199,7 @@ def light_spread(light_directions: NDArray[np.float64]) -> tuple[float, bool]:
     return float(values[-1]), bool(values[-2] < 2 * values[-1])
 
 
-def repeated_images(observations: NDArray[np.floating]) -> list[tuple[int, int]]:
+def repeated_images(observations: Floats) -> list[tuple[int, int]]:
     """Return the pairs of images among observations (P, F) that are equal up to a scale, and not uniform."""
     values = observations.astype(np.float64)
     values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.lights.light_fit import Factors, find_factors
@@ -17,6 +16,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
 
 
@@ -25,7 +25,7 @@ class Evidence:
     """F images and their lights as the checks see them; what several checks need is found once."""
 
     names: Sequence[str]
-    all_directions: NDArray[np.float64]  # (N, 3), all lights of the file, in its order
+    all_directions: Doubles  # (N, 3), all lights of the file, in its order
     indices: Sequence[int]  # (F,), those of the images
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
@@ -37,7 +37,7 @@ class Evidence:
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
     linear: bool = True  # whether the values of the images are taken as linear
-    truth: NDArray[np.floating] | None = None  # (H, W, 3), the ground truth of the whole images, or None
+    truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
     strict: bool = False  # also warn of what the images do not tell
     background: float = 0.0  # the share of dark background that was left out of the sample
 
@@ -48,7 +48,7 @@ class Evidence:
         samples: tuple[Sample, Sample],
         indices: Sequence[int],
         *,
-        truth: NDArray[np.floating] | None = None,
+        truth: Floats | None = None,
         strict: bool = False,
     ) -> Evidence:
         """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
@@ -72,12 +72,12 @@ class Evidence:
         )
 
     @cached_property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Doubles:
         """The directions (F, 3) of the images' lights."""
         return self.all_directions[list(self.indices)]
 
     @cached_property
-    def observations(self) -> NDArray[np.floating]:
+    def observations(self) -> Floats:
         """The sample's observations (p, F) as they would be if near lamps were distant.
 
         The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as

@@ -16,9 +16,8 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_values, shade
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import rough_normals
+from splinecli.maths.arrays import Doubles, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
-
-Array = NDArray[np.float64]
 
 DISPLAY_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 
@@ -49,7 +48,7 @@ _DARK_SHARE, _SHADOW_SHARE, _FITS = 0.1, 0.1, 6
 _ENCODED_SHADOW_SHARE = 0.35  # encoded, 0.1 is 0.35: what is shadow in one reading is in the other, too
 
 
-def encoded_values(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
+def encoded_values(sample: Sample, light_directions: Doubles) -> list[CaptureWarning]:
     """Warn of a sample whose values fit distant lights (F, 3) much better if they are decoded."""
     _, values = _choose(sample.observations)
     if not len(values):
@@ -67,7 +66,7 @@ def encoded_values(sample: Sample, light_directions: Array) -> list[CaptureWarni
     return [CaptureWarning(codes.ENCODED_VALUES, text)]
 
 
-def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
+def near_lamps(sample: Sample, light_directions: Doubles) -> list[CaptureWarning]:
     """Warn of a sample that fits lamps in these directions (F, 3) much better if they are near."""
     near = near_distance(sample, light_directions)
     if near is None:
@@ -80,9 +79,7 @@ def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
     return [CaptureWarning(codes.LAMPS_NEAR, text)]
 
 
-def check_ground_truth(
-    sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating] | None
-) -> list[CaptureWarning]:
+def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
     """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame.
 
     It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
@@ -109,7 +106,7 @@ def check_ground_truth(
     return [CaptureWarning(code, text)]
 
 
-def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float] | None:
+def near_distance(sample: Sample, light_directions: Doubles) -> tuple[float, float] | None:
     """Return the distance of the lamps in widths of the object at which a sample fits best, and the share it leaves.
 
     The surface counts as a plane, and all lamps (F, 3) as equally far from the middle of the image. Returns None where
@@ -141,7 +138,7 @@ def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float
     return float(-2 * square / slope), ratios[best]
 
 
-def _choose(observations: NDArray[np.floating]) -> tuple[NDArray[np.intp], Array]:
+def _choose(observations: Floats) -> tuple[NDArray[np.intp], Doubles]:
     """Return rows (p,) of lit pixels, evenly spread, and their values (p, F), scaled to 1; none for too few."""
     n_lights = observations.shape[1]
     none = np.zeros(0, np.intp), np.zeros((0, n_lights))
@@ -154,7 +151,7 @@ def _choose(observations: NDArray[np.floating]) -> tuple[NDArray[np.intp], Array
     return (chosen[enough], values[enough]) if enough.sum() >= _MIN_PIXELS else none
 
 
-def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float = _SHADOW_SHARE) -> Array:
+def _misfits(values: Doubles, lights: Doubles, gamma: float = 1.0, *, shadow: float = _SHADOW_SHARE) -> Doubles:
     """Return mean and median |difference| of lit values (p, F), above `shadow`, from a robust fit of I^gamma = l . b.
 
     The lights (F, 3) or (p, F, 3) have any length.
@@ -167,7 +164,7 @@ def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float 
     return np.array((differences.mean(), np.median(differences)))
 
 
-def _roundness(values: Array, lights: Array, places: NDArray[np.integer]) -> float:
+def _roundness(values: Doubles, lights: Doubles, places: Integers) -> float:
     """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
     lit = (values > _SHADOW_SHARE).astype(np.float64)
     across = unit(fit_scaled_normals(values, lit, lights))[:, :2]

@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import fit_robustly, shadow_weights
+from splinecli.maths.arrays import Bools, Doubles, Floats
 from splinecli.maths.normals import unit
-
-Array = NDArray[np.float64]
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
@@ -28,9 +26,9 @@ _FITS = 5
 class RoughNormals:
     """Normals on a grid of pixels."""
 
-    normals: Array  # (h, w, 3), unit in the mask, zero outside
-    mask: NDArray[np.bool_]  # (h, w)
-    outward: Array  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
+    normals: Doubles  # (h, w, 3), unit in the mask, zero outside
+    mask: Bools  # (h, w)
+    outward: Doubles  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
 
     @property
     def rim_steepness(self) -> float:
@@ -38,7 +36,7 @@ class RoughNormals:
         rim = self.outward.any(axis=2)
         return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
 
-    def transformed(self, matrix: Array) -> RoughNormals:
+    def transformed(self, matrix: Doubles) -> RoughNormals:
         """Return the normals that the lights would give after a multiplication with a matrix (3, 3)."""
         normals = self.normals @ np.linalg.inv(matrix)
         return RoughNormals(np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward)
@@ -67,7 +65,7 @@ class RoughNormals:
         return float((along * self.outward[steep]).sum(axis=1).mean())
 
 
-def rough_normals(observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]) -> RoughNormals:
+def rough_normals(observations: Floats, light_directions: Doubles, mask: Bools) -> RoughNormals:
     """Return smoothed normals of a fit of least absolute deviations.
 
     Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
@@ -77,18 +75,18 @@ def rough_normals(observations: NDArray[np.floating], light_directions: Array, m
     return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)
 
 
-def smooth_normals(vectors: NDArray[np.floating], mask: NDArray[np.bool_]) -> RoughNormals:
+def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
     """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H, W)."""
     from scipy.ndimage import gaussian_filter
 
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(vectors)
-    smooth = np.stack([gaussian_filter(normals[..., axis], SMOOTHING) for axis in range(3)], axis=2)
+    smooth = gaussian_filter(normals, (SMOOTHING, SMOOTHING, 0))
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
     return RoughNormals(smooth, mask, _outward(mask))
 
 
-def _outward(mask: NDArray[np.bool_]) -> Array:
+def _outward(mask: Bools) -> Doubles:
     """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
     from scipy.ndimage import distance_transform_edt
 
@@ -100,14 +98,14 @@ def _outward(mask: NDArray[np.bool_]) -> Array:
     return np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
 
 
-def outward_directions(mask: NDArray[np.bool_], sigma: float) -> Array:
+def outward_directions(mask: Bools, sigma: float) -> Doubles:
     """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels falls; else zero."""
     from scipy.ndimage import gaussian_filter
 
     return unit(-np.stack(_derivatives(gaussian_filter(mask.astype(np.float64), sigma)), axis=2))
 
 
-def _derivatives(values: Array) -> tuple[Array, Array]:
+def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
     """Return the derivatives to the right and upwards; zero along a side of one pixel."""
     downwards, right = (
         np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)

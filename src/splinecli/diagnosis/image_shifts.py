@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.sample import Sample
+from splinecli.maths.arrays import Bools, Singles
 
 LARGEST = 8  # largest shift that is looked for, in pixels of the sample
 
@@ -60,7 +60,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     return shifts_against(still) if found and len(still) >= _MIN_PREDICTORS else found
 
 
-def _predictions(values: NDArray[np.float32], predictors: Sequence[int]) -> Iterator[NDArray[np.float32]]:
+def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles]:
     """Yield for each image of (P, F) what the three strongest factors of the predictors explain of it, (P,)."""
     products = values.T @ values
     for place in range(len(products)):
@@ -72,9 +72,7 @@ def _predictions(values: NDArray[np.float32], predictors: Sequence[int]) -> Iter
         yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
 
 
-def _shift(
-    image: NDArray[np.float32], predicted: NDArray[np.float32], mask: NDArray[np.bool_], inner: NDArray[np.float32]
-) -> tuple[int, int] | None:
+def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> tuple[int, int] | None:
     """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images agrees; or None."""
     detail, expected = _detail(image, mask), _detail(predicted, mask)
     correlations = _correlations(detail, expected, inner)
@@ -94,9 +92,7 @@ def _shift(
     return right, down
 
 
-def _correlations(
-    detail: NDArray[np.float32], expected: NDArray[np.float32], inner: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles:
     """Return the correlations of two images (H, W) at shifts down and right from -LARGEST to LARGEST."""
     import cv2
 
@@ -106,12 +102,12 @@ def _correlations(
     return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
 
 
-def _peak(correlations: NDArray[np.float32]) -> tuple[int, int]:
+def _peak(correlations: Singles) -> tuple[int, int]:
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
     return int(right) - LARGEST, int(down) - LARGEST
 
 
-def _halves(inner: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+def _halves(inner: Singles) -> Iterator[Singles]:
     """Yield the left, right, upper and lower half of the pixels of a map (H, W)."""
     for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
         yield inner * (places <= middle)
@@ -123,13 +119,13 @@ def _top(before: float, middle: float, after: float) -> float:
     return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
 
 
-def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _detail(values: Singles, mask: Bools) -> Singles:
     """Return values (P,) without their blur, over the local contrast, on a map (H, W); zero outside the mask."""
     import cv2
 
     inside = mask.astype(np.float32)
 
-    def blur(array: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
+    def blur(array: Singles, deviation: float) -> Singles:
         weight = cv2.GaussianBlur(inside, (0, 0), deviation)
         return np.asarray(cv2.GaussianBlur(array, (0, 0), deviation) / np.maximum(weight, 1e-3), np.float32)
 
@@ -141,11 +137,9 @@ def _detail(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.
     return np.asarray(detail.clip(-_LIMIT, _LIMIT), np.float32)
 
 
-def _inner(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _inner(mask: Bools) -> Singles:
     """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
     import cv2
 
-    side = 2 * LARGEST + 1
-    padded = np.pad(mask.astype(np.uint8), LARGEST)
-    inner = cv2.erode(padded, np.ones((side, side), np.uint8))[LARGEST:-LARGEST, LARGEST:-LARGEST]
-    return inner.astype(np.float32)
+    shifts = np.ones((2 * LARGEST + 1, 2 * LARGEST + 1), np.uint8)
+    return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
@@ -20,8 +19,7 @@ from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, Li
 from splinecli.diagnosis.frame_evidence import rough_normals
 from splinecli.diagnosis.light_order import MIN_LIGHTS, UNKNOWN_ORDER, ZENITH, check_order
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 
 CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
@@ -40,7 +38,7 @@ class Candidate:
 
     name: str  # in words, such as "y negated"
     frame: LightFrame | None  # its frame, relative to the given one. None where it is an order that no frame stands for
-    matrix: Array = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
+    matrix: Doubles = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
     curl: float  # of the normals; 0 is a surface
     rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
     steps: int = 0  # by how many lights it shifts the order
@@ -63,7 +61,7 @@ class LightCheck:
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its misfit
     outline_counts: float  # how much the normals at the mask's edge count, from 0 to 1
     # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no order fits
-    mended: Array | None
+    mended: Doubles | None
     # an image that contradicts the others, without which all this was found; None if there is none
     odd_image: OddImage | None = None
 
@@ -87,9 +85,9 @@ class LightCheck:
 
 
 def check_lights(
-    observations: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    light_directions: Array,
+    observations: Floats,
+    mask: Bools,
+    light_directions: Doubles,
     indices: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
@@ -119,10 +117,10 @@ def check_lights(
 
 
 def _check_frame_and_order(
-    observations: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    light_directions: Array,
-    chosen: NDArray[np.integer],
+    observations: Floats,
+    mask: Bools,
+    light_directions: Doubles,
+    chosen: Integers,
     names: Sequence[str],
     factors: Factors | None,
 ) -> LightCheck:
@@ -132,7 +130,7 @@ def _check_frame_and_order(
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
     weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
 
-    def candidate(name: str, frame: LightFrame | None, matrix: Array, steps: int = 0) -> Candidate:
+    def candidate(name: str, frame: LightFrame | None, matrix: Doubles, steps: int = 0) -> Candidate:
         turned = normals.transformed(matrix)
         return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, steps)
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.lights.light_fit import (
     Factors,
@@ -24,8 +23,7 @@ from splinecli.capture.lights.light_fit import (
 )
 from splinecli.capture.lights.light_rows import zenith_as_elevation
 from splinecli.diagnosis.light_rings import mend_rings
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 
 MIN_LIGHTS = 6  # fewer lights leave too few equations to judge their order
 
@@ -77,7 +75,7 @@ class Turn(NamedTuple):
 
     words: str
     steps: int
-    matrix: Array
+    matrix: Doubles
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +83,8 @@ class LightOrder:
     """The order of lights that fits best."""
 
     order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
-    lights: Array  # (F, 3), in this order
-    intensities: Array  # (F,), those that fit these lights best, for metals; ones where only known ones tell the order
+    lights: Doubles  # (F, 3), in this order
+    intensities: Doubles  # (F,), that fit these lights best, for metals; ones where only known ones tell the order
     given_misfit: float = np.nan  # as a share of random orders'; NaN where there are too few lights
     misfit: float = np.nan  # that of this order
     plausible: bool = True  # whether the lights fit well enough for the normals to tell an outline
@@ -98,16 +96,12 @@ class _Reading(NamedTuple):
     """An order of the lights: in words, or None for the given one; its lights (F, 3) and their misfit."""
 
     words: str | None
-    lights: Array
+    lights: Doubles
     misfit: float
 
 
 def check_order(
-    observations: NDArray[np.floating],
-    factors: Factors | None,
-    light_directions: Array,
-    chosen: NDArray[np.integer],
-    names: Sequence[str],
+    observations: Floats, factors: Factors | None, light_directions: Doubles, chosen: Integers, names: Sequence[str]
 ) -> LightOrder:
     """Return the order of the chosen lights that fits observations (P, F) best.
 
@@ -161,7 +155,7 @@ def check_order(
     )
 
 
-def _best_exchange(factors: Factors, lights: Array, names: Sequence[str]) -> _Reading:
+def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _Reading:
     swaps = swapped_orders(len(lights))
     misfits = factors.misfits(lights[swaps])
     best = int(misfits.argmin())
@@ -169,7 +163,7 @@ def _best_exchange(factors: Factors, lights: Array, names: Sequence[str]) -> _Re
     return _Reading(f"with those of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
 
 
-def _is_wrong(observations: NDArray[np.floating], factors: Factors, given: _Reading, random: Array) -> bool:
+def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Doubles) -> bool:
     """Return whether lights fit no better than those in random orders do, whose misfits are given."""
     n_lights = len(given.lights)
     by_chance = n_lights >= MIN_LIGHTS_FOR_CHANCE and (random <= given.misfit).mean() > CHANCE
@@ -186,7 +180,7 @@ def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
     return bool(misfit <= MAX_PLAIN_MISFIT * max(float(np.median(random)), 1e-9))
 
 
-def _free_if_possible(factors: Factors, lights: Array) -> tuple[Factors, Array]:
+def _free_if_possible(factors: Factors, lights: Doubles) -> tuple[Factors, Doubles]:
     """Return factors that are compared with lights of any intensities, if these tell orders, and random misfits."""
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
@@ -196,7 +190,7 @@ def _free_if_possible(factors: Factors, lights: Array) -> tuple[Factors, Array]:
     return free, random
 
 
-def _fits_like_random(observations: NDArray[np.floating], factors: Factors, lights: Array) -> bool:
+def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -> bool:
     """Return whether lights fit the pixels little better than in random orders."""
     # The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
     values = sample_pixels(observations)
@@ -208,7 +202,7 @@ def _fits_like_random(observations: NDArray[np.floating], factors: Factors, ligh
     return given > RANDOM_FIT * float(np.median(random))
 
 
-def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[Turn, ...]:
+def _turns(lights: Doubles, shifted: Doubles, fitting: Bools) -> tuple[Turn, ...]:
     """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights (F, 3) in place."""
     inverse, n_all = np.linalg.pinv(lights), len(shifted) // 2
     turns = []

@@ -7,11 +7,9 @@ begin at another lamp, or run the other way round.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.lights.light_fit import Factors
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Doubles, Integers
 
 FEWEST_IN_RING = 4
 _GAP_DEG = 3.0  # lights belong to one ring if their elevations follow each other at smaller steps
@@ -28,7 +26,7 @@ _WAYS = {
 """The step through the lamps of a ring, and the signs of x and y."""
 
 
-def mend_rings(factors: Factors, lights: Array) -> tuple[str, Array, float]:
+def mend_rings(factors: Factors, lights: Doubles) -> tuple[str, Doubles, float]:
     """Return what mends the rings of lights (F, 3), in words (none if they fit), the mended lights and their misfit.
 
     Rings are mended one after the other, the best first, as long as the images fit clearly better. The images show how
@@ -52,7 +50,7 @@ def mend_rings(factors: Factors, lights: Array) -> tuple[str, Array, float]:
     return _in_words([(rings[ring], found[ring]) for ring in sorted(found) if found[ring]]), mended, misfit
 
 
-def find_rings(lights: Array) -> list[NDArray[np.integer]]:
+def find_rings(lights: Doubles) -> list[Integers]:
     """Return the indices of the lights (F, 3) of each ring that has enough of them."""
     elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
     order = elevation.argsort(kind="stable")
@@ -61,7 +59,7 @@ def find_rings(lights: Array) -> list[NDArray[np.integer]]:
     return [ring for ring in rings if len(ring) >= FEWEST_IN_RING] if len(rings) > 1 else []
 
 
-def _readings(given: Array) -> Iterator[tuple[str, Array]]:
+def _readings(given: Doubles) -> Iterator[tuple[str, Doubles]]:
     """Yield the readings of a ring (n, 3), in words and directions (n, 3), the simplest first."""
     for steps in sorted(range(len(given)), key=lambda steps: min(steps, len(given) - steps)):
         shift = "" if steps == 0 else f"shifted by {min(steps, steps - len(given), key=abs):+d}"
@@ -70,7 +68,7 @@ def _readings(given: Array) -> Iterator[tuple[str, Array]]:
             yield " and ".join(filter(None, (way, shift))), directions
 
 
-def _in_words(mended: Sequence[tuple[NDArray[np.integer], str]]) -> str:
+def _in_words(mended: Sequence[tuple[Integers, str]]) -> str:
     """Return words for mended rings, from their lights and their words, such as "with lights 9 to 16 shifted by +1"."""
     parts: dict[str, list[str]] = {}
     for lamps, words in mended:
@@ -79,6 +77,6 @@ def _in_words(mended: Sequence[tuple[NDArray[np.integer], str]]) -> str:
     return f"with {named}" if named else ""
 
 
-def _numbers(numbers: NDArray[np.integer]) -> str:
+def _numbers(numbers: Integers) -> str:
     whole = len(numbers) == numbers[-1] - numbers[0] + 1
     return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))

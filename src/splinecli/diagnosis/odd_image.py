@@ -10,11 +10,9 @@ half in shadow, or one light was moved by 40 degrees.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.lights.light_fit import Factors
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Doubles
 
 MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
 MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness
@@ -43,7 +41,7 @@ class OddImage:
     brightness: float | None = None
 
 
-def find_odd_image(factors: Factors, light_directions: Array) -> OddImage | None:
+def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | None:
     """Return the image that contradicts the others under lights (F, 3), or None."""
     if len(light_directions) < MIN_LIGHTS:
         return None
@@ -64,7 +62,7 @@ def find_odd_image(factors: Factors, light_directions: Array) -> OddImage | None
     return None
 
 
-def _shares_left(factors: Factors, light_directions: Array) -> Array:
+def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
     """Return the mean square misfits (F,) without each image, as roots of their shares of that of all images."""
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
@@ -77,7 +75,7 @@ def _shares_left(factors: Factors, light_directions: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(left, 0) * n_lights / (n_lights - 1)) / misfit)
 
 
-def _brightness(factors: Factors, light_directions: Array, place: int) -> float | None:
+def _brightness(factors: Factors, light_directions: Doubles, place: int) -> float | None:
     """Return the brightness of an image as a share of what the others predict; None where it is not only scaled."""
     if not factors.intensities_known:
         return None

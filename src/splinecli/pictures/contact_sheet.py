@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Bools, Floats
 from splinecli.maths.normals import encode_picture
 from splinecli.pictures.png import Picture
 from splinecli.pixel_sets.store import Entry, PixelSet
@@ -46,7 +47,7 @@ def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
     return np.hstack(tiles)
 
 
-def _on_mask(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.floating]:
+def _on_mask(values: Floats, mask: Bools) -> Floats:
     picture = np.zeros((*mask.shape, values.shape[1]), values.dtype)
     picture[mask] = values
     return picture

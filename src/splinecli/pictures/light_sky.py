@@ -1,17 +1,16 @@
 """A plot of the light directions of a capture as the camera sees them, on the disc of observation maps."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import printable
+from splinecli.maths.arrays import Doubles
+from splinecli.maths.normals import unit
 from splinecli.pictures.plotting import png_bytes
 
 _RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
 
 
-def sky_plot(
-    light_directions: NDArray[np.float64], title: str, *, errors_deg: NDArray[np.float64] | None = None
-) -> bytes:
+def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | None = None) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
     The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle of this radius is
@@ -38,12 +37,9 @@ def sky_plot(
     return png_bytes(figure, 120)
 
 
-def _circles(
-    directions: NDArray[np.float64], radii: NDArray[np.float64], angle: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
     """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
-    across = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = unit(np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)]))
     turned = np.cross(directions, across)
     around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
     cosine, sine = np.cos(radii)[:, None, None], np.sin(radii)[:, None, None]

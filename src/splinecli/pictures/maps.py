@@ -1,8 +1,8 @@
 """Pictures of the maps of one capture: albedo, confidence, a preview of the surface, and angular errors."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Bools, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.pictures.png import Picture
@@ -23,7 +23,7 @@ _USUAL_HEIGHT = 400
 _BACKGROUND, _INK = 255, 0
 
 
-def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
+def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
     """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the pixels are white.
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
@@ -32,12 +32,12 @@ def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> Pict
     return encode_srgb(albedo / white)
 
 
-def confidence_picture(confidence_map: NDArray[np.float32]) -> Picture:
+def confidence_picture(confidence_map: Singles) -> Picture:
     """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
     return np.rint(255 * confidence_map).astype(np.uint8)
 
 
-def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
+def preview_picture(normal_map: Singles, mask: Bools) -> Picture:
     """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
 
     It is black outside the mask (H, W).
@@ -46,13 +46,13 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-def signed_picture(values: NDArray[np.float32], scale: float) -> Picture:
+def signed_picture(values: Singles, scale: float) -> Picture:
     """Return values (H, W) as a gray picture (H, W): 0 and NaN are gray, -scale is black, scale is white."""
     share = np.nan_to_num(values / scale).clip(-1, 1)
     return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)
 
 
-def error_map_picture(error_map_deg: NDArray[np.floating]) -> Picture:
+def error_map_picture(error_map_deg: Floats) -> Picture:
     """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its right.
 
     A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to
@@ -67,7 +67,7 @@ def error_map_picture(error_map_deg: NDArray[np.floating]) -> Picture:
     return np.hstack([picture, _colour_bar(len(picture))])
 
 
-def colour_errors(error_map_deg: NDArray[np.floating]) -> Picture:
+def colour_errors(error_map_deg: Floats) -> Picture:
     """Return the colours (H, W, 3) of errors (H, W) in degrees: viridis, from violet for 0 to yellow; white for NaN."""
     import cv2
 
@@ -79,7 +79,7 @@ def colour_errors(error_map_deg: NDArray[np.floating]) -> Picture:
     return picture
 
 
-def bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+def bounding_box(mask: Bools) -> tuple[slice, slice]:
     """Return the rows and the columns of the smallest box that has all of a mask (H, W)."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Bools, Floats
 from splinecli.maths.normals import encode_picture
 from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes
@@ -28,10 +28,10 @@ _WHITE = 255
 
 
 def method_maps(
-    ground_truth: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    normal_maps: Mapping[str, NDArray[np.floating]],
-    error_maps_deg: Mapping[str, NDArray[np.floating]],
+    ground_truth: Floats,
+    mask: Bools,
+    normal_maps: Mapping[str, Floats],
+    error_maps_deg: Mapping[str, Floats],
     *,
     title: str,
 ) -> bytes:
@@ -124,7 +124,7 @@ def _resize(picture: Picture, scale: float) -> Picture:
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _colour_normals(normals: NDArray[np.floating], known: NDArray[np.bool_]) -> Picture:
+def _colour_normals(normals: Floats, known: Bools) -> Picture:
     """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if NaN is there."""
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
     colours[~known] = _WHITE

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from splinecli.maths.arrays import Floats, Integers
 from splinecli.pictures.plotting import png_bytes
 
 if TYPE_CHECKING:
@@ -21,12 +19,12 @@ _SMALL, _LARGE = 8, 9  # points
 
 
 def observation_map_figure(
-    sparse: NDArray[np.floating],
-    dense: NDArray[np.floating] | None,
-    truth: NDArray[np.floating] | None,
+    sparse: Floats,
+    dense: Floats | None,
+    truth: Floats | None,
     *,
-    error_deg: NDArray[np.floating],
-    pixels: NDArray[np.integer] | None = None,
+    error_deg: Floats,
+    pixels: Integers | None = None,
     truth_label: str = "true map, all lights",
     title: str = "",
     grid: Grid = "even",

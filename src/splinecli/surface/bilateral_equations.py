@@ -23,15 +23,16 @@ far as the normal is contradicted, with r the larger residual of the two sides:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Bools, Doubles, Floats
 from splinecli.maths.normals import unit
 from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
 
-Floats = NDArray[np.float64]
 Pixels = NDArray[np.int32]
 STIFFNESS = 2.0  # how easily the surface tears, as in the paper
 CONTRADICTION = 0.3  # residual that contradicts a normal: that of a frontal one which is off by 17 degrees
@@ -46,16 +47,16 @@ SMALLEST_COSINE = 0.05
 class BilateralEquations:
     """The equations of P pixels."""
 
-    facing: Floats  # (P,), zero where the normal is not usable
-    slants: tuple[Floats, Floats]  # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    facing: Doubles  # (P,), zero where the normal is not usable
+    slants: tuple[
+        Doubles, Doubles
+    ]  # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
     # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
     # above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
 
     @classmethod
-    def from_normals(
-        cls, normal_map: NDArray[np.floating], mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
-    ) -> BilateralEquations:
+    def from_normals(cls, normal_map: Floats, mask: Bools, camera_matrix: Floats | None) -> BilateralEquations:
         """Return the equations of a normal map (H, W, 3) at the pixels of a mask (H, W)."""
         normals = unit(normal_map[mask].astype(np.float64))
         if camera_matrix is None:
@@ -75,7 +76,7 @@ class BilateralEquations:
             (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
         )
 
-    def weigh(self, heights: Floats, stiffness: float) -> tuple[Floats, Floats]:
+    def weigh(self, heights: Doubles, stiffness: float) -> tuple[Doubles, Doubles]:
         """Return the weights of all pairs at the heights (P,), and their flows.
 
         The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
@@ -142,13 +143,13 @@ class LaplacianSolver:
 
     def solve(
         self,
-        weights: Floats,
-        flows: Floats,
+        weights: Doubles,
+        flows: Doubles,
         *,
         precision: float,
-        pull: Floats | float = 0.0,
-        distance: Floats | float = 0.0,
-    ) -> Floats:
+        pull: Doubles | float = 0.0,
+        distance: Doubles | float = 0.0,
+    ) -> Doubles:
         """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
 
         Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
@@ -156,37 +157,29 @@ class LaplacianSolver:
         that of the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
+        from scipy.sparse import csr_matrix
         from scipy.sparse.linalg import cg
 
-        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
+        damped = weights + _DAMPING_OF_GAPS
+        diagonal = self._sum(damped, self._near) + self._sum(damped, self._far) + _DAMPING_OF_HEIGHTS + pull
+        values = np.concatenate((-damped, -damped, diagonal))[self._pattern.data]
+        matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
-        steps = 0
-
-        def count(_: Floats) -> None:
-            nonlocal steps
-            steps += 1
-
-        change: Floats
+        steps = count()
+        change: Doubles
         change, _ = cg(
             matrix,
             self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
             rtol=precision,
             maxiter=_MAX_STEPS,
             M=self._preconditioner,
-            callback=count,
+            callback=lambda _: next(steps),
         )
-        if steps > _STEPS_BEFORE_RENEWAL:
+        if next(steps) > _STEPS_BEFORE_RENEWAL:
             self._preconditioner = None
         return change
 
-    def _laplacian(self, weights: Floats, pull: Floats | float) -> Any:
-        from scipy.sparse import csr_matrix
-
-        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
-        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
-        return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
-
-    def _sum(self, of_pairs: Floats, pixels: Pixels) -> Floats:
+    def _sum(self, of_pairs: Doubles, pixels: Pixels) -> Doubles:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

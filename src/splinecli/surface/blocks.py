@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
+from splinecli.maths.arrays import Array, Bools, Floats, Integers, Singles
 
 
 @dataclass(frozen=True)
 class Blocks:
     """The blocks of step x step pixels that contain a pixel of the object."""
 
-    mask: NDArray[np.bool_]  # (h, w) bool, true for these blocks; p of them
+    mask: Bools  # (h, w) bool, true for these blocks; p of them
     step: int  # pixels along a side of a block
 
     @classmethod
-    def over(cls, mask: NDArray[np.bool_], number: int) -> Blocks:
+    def over(cls, mask: Bools, number: int) -> Blocks:
         """Return about `number` blocks over the pixels of a mask (H, W), at most twice as many."""
         step = max(1, math.ceil(math.sqrt(np.count_nonzero(mask) / number)))
         blocks = cls.of_step(mask, step)
@@ -29,7 +27,7 @@ class Blocks:
         return blocks
 
     @classmethod
-    def of_step(cls, mask: NDArray[np.bool_], step: int) -> Blocks:
+    def of_step(cls, mask: Bools, step: int) -> Blocks:
         """Return the blocks of step x step pixels over the pixels of a mask (H, W)."""
         for axis, size in enumerate(mask.shape):
             mask = np.logical_or.reduceat(mask, np.arange(0, size, step), axis=axis)
@@ -40,7 +38,7 @@ class Blocks:
         rows, columns = np.nonzero(self.mask)
         return rows * self.step + self._shift, columns * self.step + self._shift
 
-    def average(self, values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+    def average(self, values: Array, mask: Bools) -> Array:
         """Return the means (p, F) over the blocks of the values (P, F) of a mask's pixels."""
         if self.step == 1:
             return values
@@ -55,7 +53,7 @@ class Blocks:
         shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
         return np.asarray(shrunk @ camera_matrix)
 
-    def interpolate(self, depth: Floats, mask: NDArray[np.bool_]) -> Floats:
+    def interpolate(self, depth: Floats, mask: Bools) -> Floats:
         """Return the depths (P,) of the pixels of a mask (H, W) from those of the blocks (h, w)."""
         if self.step == 1:
             return depth[mask]
@@ -64,12 +62,12 @@ class Blocks:
         places = [(axis - self._shift) / self.step for axis in np.nonzero(mask)]
         return np.asarray(map_coordinates(self.spread(depth[self.mask]), places, order=1, mode="nearest"))
 
-    def numbers_at(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.integer]:
+    def numbers_at(self, rows: Integers, columns: Integers) -> Integers:
         """Return the numbers (P,) of the blocks of some pixels."""
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
         return np.asarray(number[rows // self.step, columns // self.step])
 
-    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+    def spread(self, values: Array) -> Array:
         """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells have those of the nearest."""
         from scipy.ndimage import distance_transform_edt
 
@@ -77,9 +75,7 @@ class Blocks:
         nearest = distance_transform_edt(~self.mask, return_distances=False, return_indices=True)
         return np.asarray(values[number[tuple(nearest)]])
 
-    def sample(
-        self, maps: NDArray[np.float32], rows: NDArray[np.integer], columns: NDArray[np.integer]
-    ) -> NDArray[np.float32]:
+    def sample(self, maps: Singles, rows: Integers, columns: Integers) -> Singles:
         """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation between the centres."""
         height, width, count = maps.shape
         found = np.zeros((len(rows), count), np.float32)

@@ -6,15 +6,14 @@ z to the camera.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Bools, Doubles, Floats
 
-Floats = NDArray[np.float64]
 _LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 
 
-def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:
+def pixel_rays(mask: Bools, camera_matrix: Floats) -> Doubles:
     """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
 
     Raises UsageError if the camera matrix is not 3 x 3, or InputError if the numbers are not those of a camera matrix.
@@ -24,9 +23,7 @@ def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> 
     return image @ ray_basis(camera_matrix)
 
 
-def image_points(
-    points: NDArray[np.floating], shape: tuple[int, ...], camera_matrix: NDArray[np.floating] | None
-) -> Floats:
+def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None) -> Doubles:
     """Return the columns and rows (P, 2) at which a camera sees points (P, 3); without a matrix it is orthographic.
 
     The points are from the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
@@ -37,12 +34,12 @@ def image_points(
     return np.asarray(image[:, :2] / image[:, 2:])
 
 
-def focal_length(camera_matrix: NDArray[np.floating]) -> float:
+def focal_length(camera_matrix: Floats) -> float:
     """Return the focal length in pixels: the geometric mean of both axes."""
     return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))
 
 
-def ray_basis(camera_matrix: NDArray[np.floating]) -> Floats:
+def ray_basis(camera_matrix: Floats) -> Doubles:
     """Return the rows (3, 3) that turn an image point (column, row, 1) into its ray.
 
     The first row is the step of a ray from one column to the next, the second the step from one row to the next, and

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length, image_points, ray_basis
@@ -26,17 +27,15 @@ _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so th
 _FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
 _LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 
-Floats = NDArray[np.float64]
-
 
 def decimated_mesh(
-    depth: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None = None,
+    depth: Floats,
+    mask: Bools,
+    camera_matrix: Floats | None = None,
     colours: NDArray[np.uint8] | None = None,
     *,
     n_triangles: int,
-    normal_map: NDArray[np.floating],
+    normal_map: Floats,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal map.
@@ -81,12 +80,12 @@ def decimated_mesh(
 
 
 def _mesh_of_blocks(
-    depth: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None,
+    depth: Floats,
+    mask: Bools,
+    camera_matrix: Floats | None,
     colours: NDArray[np.uint8] | None,
     n_triangles: int,
-    normal_map: NDArray[np.floating],
+    normal_map: Floats,
     largest_step: float | None,
 ) -> SurfaceMesh | None:
     """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
@@ -120,9 +119,7 @@ def _mesh_of_blocks(
     return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
 
 
-def _tangents(
-    vertices: NDArray[np.float64], normals: NDArray[np.float64], camera_matrix: NDArray[np.floating] | None
-) -> NDArray[np.float64]:
+def _tangents(vertices: Doubles, normals: Doubles, camera_matrix: Floats | None) -> Doubles:
     """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row of the image.
 
     A row of the image shows the plane that contains the viewing rays of the row. This is how viewers compute tangents
@@ -136,7 +133,7 @@ def _tangents(
 
 
 def _normal_texture(
-    points: Floats, triangles: NDArray[np.integer], normals: Floats, tangents: Floats, normal_map: NDArray[np.floating]
+    points: Doubles, triangles: Integers, normals: Doubles, tangents: Doubles, normal_map: Floats
 ) -> NDArray[np.uint8]:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
 
@@ -156,7 +153,7 @@ def _normal_texture(
     return fill_outside(texture, known)
 
 
-def _in_frame(measured: Floats, normals: Floats, tangents: Floats) -> Floats:
+def _in_frame(measured: Doubles, normals: Doubles, tangents: Doubles) -> Doubles:
     """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be perpendicular to N."""
     bitangents = np.cross(normals, tangents)
     along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals))
@@ -168,8 +165,8 @@ def _in_frame(measured: Floats, normals: Floats, tangents: Floats) -> Floats:
 
 
 def _covered_pixels(
-    points: Floats, triangles: NDArray[np.integer], shape: tuple[int, ...]
-) -> Iterator[tuple[NDArray[np.intp], Floats, NDArray[np.intp], NDArray[np.intp]]]:
+    points: Doubles, triangles: Integers, shape: tuple[int, ...]
+) -> Iterator[tuple[NDArray[np.intp], Doubles, NDArray[np.intp], NDArray[np.intp]]]:
     """Yield the pixels whose centres lie in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
     for start in range(0, len(triangles), _TRIANGLES):
         numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
@@ -192,7 +189,7 @@ def _covered_pixels(
         yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
 
 
-def _barycentric_forms(corners: Floats) -> Floats:
+def _barycentric_forms(corners: Doubles) -> Doubles:
     """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
@@ -203,7 +200,7 @@ def _barycentric_forms(corners: Floats) -> Floats:
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 
 
-def _ranges(first: Floats, last: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _ranges(first: Doubles, last: Doubles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the whole numbers from each first to its last, and before them the number of the range of each."""
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)

@@ -14,15 +14,13 @@ from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations, LaplacianSolver
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
-
-Floats = NDArray[np.float64]
 
 _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and refuses zero vectors
 _FIRST_PRECISION, _LATER_PRECISION = 1e-9, 0.03  # relative residuals of the linear solves
@@ -44,15 +42,15 @@ Progress = Callable[[float], object]  # called with the share of the work that w
 
 
 def integrate_normals(
-    normal_map: NDArray[np.floating],
-    mask: NDArray[np.bool_] | None = None,
-    camera_matrix: NDArray[np.floating] | None = None,
+    normal_map: Floats,
+    mask: Bools | None = None,
+    camera_matrix: Floats | None = None,
     *,
     stiffness: float = STIFFNESS,
-    prior: NDArray[np.floating] | None = None,
+    prior: Floats | None = None,
     prior_detail: float | None = None,
     progress: Progress = lambda share: None,
-) -> Floats:
+) -> Doubles:
     """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera matrix, it is the
@@ -93,7 +91,7 @@ def integrate_normals(
     return _depth_map(_integrate(surface, stiffness, progress), mask, camera_matrix, known)
 
 
-def relief_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
     Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
@@ -107,10 +105,10 @@ def relief_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) 
 class _Surface(NamedTuple):
     """What is known of a surface: see integrate_normals. The prior is one of heights (P,)."""
 
-    normal_map: NDArray[np.floating]
-    mask: NDArray[np.bool_]
-    camera_matrix: NDArray[np.floating] | None
-    prior: Floats | None
+    normal_map: Floats
+    mask: Bools
+    camera_matrix: Floats | None
+    prior: Doubles | None
     prior_detail: float
 
     def of_blocks(self, blocks: Blocks, *, keep_edges: bool) -> _Surface:
@@ -127,7 +125,7 @@ class _Surface(NamedTuple):
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
 
-def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Floats:
+def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Doubles:
     """Return the heights (P,) of the mask's pixels; see integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
@@ -136,7 +134,7 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Float
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
-    heights: Floats = np.zeros(n_pixels)
+    heights: Doubles = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if stiffness > 0 else 1, 1.0
@@ -165,7 +163,7 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Float
     return heights
 
 
-def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_], *, keep_edges: bool) -> Floats:
+def _normals_of(blocks: Blocks, normals: Doubles, mask: Bools, *, keep_edges: bool) -> Doubles:
     """Return the normals (p, 3) of blocks from those of their pixels (P, 3): of the mean slope, or of the steepest one.
 
     With keep_edges, a block that contains an edge has the steepest normal, which belongs to the rim. The mean over an
@@ -185,9 +183,7 @@ def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_], *, kee
     return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
-def _heights_of_prior(
-    prior: NDArray[np.floating], mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
-) -> Floats:
+def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Doubles:
     """Return the heights (P,) of a prior in the unit of the equations, NaN where it is not known."""
     if prior.shape != mask.shape:
         raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape}, that of the normal map")
@@ -223,18 +219,16 @@ def _check_prior(surface: _Surface) -> None:
         )
 
 
-def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _mask_of_normals(normal_map: Floats) -> Bools:
     if normal_map.ndim != 3 or normal_map.shape[2] != 3:
         raise UsageError(f"the normal map has shape {normal_map.shape}, expected (H, W, 3)")
-    mask: NDArray[np.bool_] = np.isfinite(normal_map).all(axis=2) & normal_map.any(axis=2)
+    mask = np.asarray(np.isfinite(normal_map).all(axis=2) & normal_map.any(axis=2))
     if not mask.any():
         raise InputError("the normal map has no normal: all vectors are zero or not finite")
     return mask
 
 
-def _depth_map(
-    heights: Floats, mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None, prior: Floats | None
-) -> Floats:
+def _depth_map(heights: Doubles, mask: Bools, camera_matrix: Floats | None, prior: Doubles | None) -> Doubles:
     from scipy.ndimage import label
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
@@ -248,7 +242,7 @@ def _depth_map(
     return depth
 
 
-def _check_maps(normal_map: NDArray[np.floating], mask: NDArray[np.bool_]) -> None:
+def _check_maps(normal_map: Floats, mask: Bools) -> None:
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if normal_map.shape != (*mask.shape, 3):

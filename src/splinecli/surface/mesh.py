@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.camera import focal_length, image_points, pixel_rays
 
@@ -19,18 +20,18 @@ from splinecli.surface.camera import focal_length, image_points, pixel_rays
 class SurfaceMesh:
     """A triangle mesh with the textures of its image."""
 
-    vertices: NDArray[np.float32]  # (V, 3) float32
+    vertices: Singles  # (V, 3) float32
     # (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them
     triangles: NDArray[np.int32]
-    normals: NDArray[np.float32]  # (V, 3) float32, unit
+    normals: Singles  # (V, 3) float32, unit
     # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from 0 at
     # the top to 1 at the bottom, as in glTF
-    uvs: NDArray[np.float32]
+    uvs: Singles
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
     # exact. See decimation.py.
     normal_texture: NDArray[np.uint8] | None = None
-    tangents: NDArray[np.float32] | None = None  # (V, 3) float32, unit, where there is a normal texture
+    tangents: Singles | None = None  # (V, 3) float32, unit, where there is a normal texture
 
     @property
     def colours(self) -> NDArray[np.uint8] | None:
@@ -43,12 +44,12 @@ class SurfaceMesh:
 
 
 def surface_mesh(
-    depth: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None = None,
+    depth: Floats,
+    mask: Bools,
+    camera_matrix: Floats | None = None,
     colours: NDArray[np.uint8] | None = None,
     *,
-    normal_map: NDArray[np.floating] | None = None,
+    normal_map: Floats | None = None,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
     """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
@@ -91,7 +92,7 @@ def surface_mesh(
     )
 
 
-def check_triangles(mask: NDArray[np.bool_]) -> None:
+def check_triangles(mask: Bools) -> None:
     """Raise InputError if the mesh of a mask (H, W) has no triangle: no square of four pixels has three of the mask."""
     count = mask.astype(np.uint8)
     squares = count[:-1, :-1] + count[1:, :-1] + count[:-1, 1:] + count[1:, 1:]
@@ -107,7 +108,7 @@ def no_triangles() -> InputError:
     )
 
 
-def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+def vertex_normals(vertices: Floats, triangles: Integers) -> Doubles:
     """Return the unit normals (V, 3) of vertices: means over their triangles, weighted by area.
 
     A vertex without triangles has the normal (0, 0, 1).
@@ -115,17 +116,17 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer
     first, second, third = np.moveaxis(vertices[triangles].astype(np.float64), 1, 0)
     faces = np.cross(second - first, third - first).repeat(3, axis=0)
     sums = [np.bincount(triangles.ravel(), faces[:, axis], len(vertices)) for axis in range(3)]
-    normals: NDArray[np.float64] = unit(np.stack(sums, axis=1).astype(np.float64))
+    normals: Doubles = unit(np.stack(sums, axis=1).astype(np.float64))
     normals[~normals.any(axis=1)] = (0, 0, 1)
     return normals
 
 
-def texture_coordinates(points: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Singles:
     """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see SurfaceMesh.uvs."""
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
 
-def fill_outside(texture: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def fill_outside(texture: NDArray[np.uint8], known: Bools) -> NDArray[np.uint8]:
     """Return a texture (H, W, 3) in which every pixel that is not known (H, W) has the value of the nearest known one.
 
     Viewers interpolate between pixels and reduce textures, which would bring in the background at the border.
@@ -138,7 +139,7 @@ def fill_outside(texture: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArra
     return np.asarray(texture[rows, columns])
 
 
-def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _triangles(heights: Doubles, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).

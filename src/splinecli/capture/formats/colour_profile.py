@@ -4,8 +4,8 @@ import struct
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from splinecli.maths.arrays import Doubles
 from splinecli.maths.transfer import GAMMAS, SRGB, TransferCurve, decode_transfer
 
 LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Those of cameras and screens have a few kilobytes.
@@ -62,7 +62,7 @@ def _curve(tag: bytes) -> TransferCurve:
     return tuple(linear.clip(0, 1).tolist())
 
 
-def _parametric(stored: NDArray[np.float64], given: list[float]) -> NDArray[np.float64]:
+def _parametric(stored: Doubles, given: list[float]) -> Doubles:
     """Return the linear values of a parametric curve with 3, 4, 5 or 7 parameters, in the order of the standard."""
     g, a, b = given[:3]
     if a <= 0:

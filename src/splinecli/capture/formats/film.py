@@ -17,6 +17,7 @@ from splinecli.capture.formats.damage import damage_as_input_error, native_stder
 from splinecli.capture.formats.image_size import check_stored_size
 from splinecli.capture.paths import check_file, is_folder
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
 
@@ -43,7 +44,7 @@ _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIF
 
 
 # A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels.
-_Candidate = tuple[int, NDArray[np.float32], float, float]
+_Candidate = tuple[int, Singles, float, float]
 
 
 def is_film(path: Path) -> bool:
@@ -131,7 +132,7 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     return number, linear.ravel(), sharpness, clipped
 
 
-def _farthest(thumbnails: NDArray[np.float32]) -> list[int]:
+def _farthest(thumbnails: Singles) -> list[int]:
     """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Their brightness does not count."""
     if not len(thumbnails):
         return []

@@ -8,10 +8,9 @@ import os
 import re
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_image, open_with_pillow
@@ -20,6 +19,7 @@ from splinecli.capture.formats.raw import decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Bools, Singles
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -29,7 +29,7 @@ _DAMAGE = re.compile(r"premature end|bad huffman|corrupt jpeg data(?!.*extraneou
 _LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
 
 
-def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[Any]:
+def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
     The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
@@ -44,7 +44,7 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[An
     return decode_with_alpha(path, expected)[0]
 
 
-def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[NDArray[Any], NDArray[Any] | None]:
+def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[Array, Array | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
     with damage_as_input_error(path, DAMAGED, COPY_AGAIN), open_image(path) as (file, kind):
         size = facts_in(file, kind, path).size
@@ -71,7 +71,7 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
     return pixels, None
 
 
-def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
+def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
     """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
     if kind == "RAW":
         return decode_raw(file.read(), path)
@@ -90,14 +90,14 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
     return _decode_with_opencv(data)
 
 
-def _decode_with_opencv(data: bytes) -> NDArray[Any]:
+def _decode_with_opencv(data: bytes) -> Array:
     """Return pixels (H, W) or (H, W, C), in RGB or RGBA order. Raises ValueError or cv2.error for a damaged file."""
     import cv2
 
     with native_stderr() as messages:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
-            pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            pixels: Array | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             if error.code == cv2.Error.StsNoMem:
                 raise MemoryError from None
@@ -153,7 +153,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
     raise InputError("the JPEG is truncated", path=path, hint=COPY_AGAIN)
 
 
-def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.float32]:
+def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Singles:
     """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be linear.
 
     The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
@@ -165,7 +165,7 @@ def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[n
     return to_linear(decode_image(Path(path), expected), Path(path))
 
 
-def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
+def to_linear(stored: Array, path: Path) -> Singles:
     """Return stored values of any shape as float32 on the scale of read_image.
 
     Raises InputError for a floating-point value that is negative or not finite.
@@ -185,7 +185,7 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     return values
 
 
-def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.bool_]:
+def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
     So 0 and 1 serve as well as 0 and 255. If an alpha channel cuts something out, it alone is the mask, because colours
@@ -206,7 +206,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np
     return np.asarray((stored > stored.max() / 2).any(axis=2))
 
 
-def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+def cut_out(alpha: Array | None) -> Bools | None:
     """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
 
     Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.

@@ -9,14 +9,14 @@ import zlib
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import damage_as_input_error
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array
 
 KEY = "Normal_gt"
 
@@ -42,7 +42,7 @@ class _Variable(NamedTuple):
     compressed: bool
 
 
-def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
+def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
     """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type of the stored numbers.
 
     Sizes are checked before anything is read or expanded.
@@ -65,7 +65,7 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
         return _numbers(file, variable)
 
 
-def read_matrices(path: Path) -> dict[str, NDArray[Any]]:
+def read_matrices(path: Path) -> dict[str, Array]:
     """Return the numeric matrices of a small file by name. Raises InputError."""
     with damage_as_input_error(path, "the .mat file is damaged", "Save it again"), path.open("rb") as file:
         return {
@@ -75,7 +75,7 @@ def read_matrices(path: Path) -> dict[str, NDArray[Any]]:
         }
 
 
-def _numbers(file: BinaryIO, variable: _Variable) -> NDArray[Any]:
+def _numbers(file: BinaryIO, variable: _Variable) -> Array:
     most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
     content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
     kind, numbers = next(islice(_parts(content, variable.order), 3, None))

@@ -15,10 +15,9 @@ and OpenEXR files.
 import io
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_facts
@@ -28,6 +27,7 @@ from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
 from splinecli.capture.paths import StrPath, check_file
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
 from splinecli.system.extras import import_extra
 
@@ -45,14 +45,12 @@ _LONGEST_NUMBER = 32  # characters of a number in a text, with what separates it
 class _Stored(NamedTuple):
     """Vectors as a file stores them."""
 
-    values: NDArray[Any]  # (H, W, 3); those of a picture are colours, n = 2 v / full scale - 1
-    alpha: NDArray[Any] | None  # (H, W), the alpha channel of a picture
+    values: Array  # (H, W, 3); those of a picture are colours, n = 2 v / full scale - 1
+    alpha: Array | None  # (H, W), the alpha channel of a picture
     is_picture: bool
 
 
-def read_normal_map(
-    path: StrPath, mask: NDArray[np.bool_] | Path | None = None, *, convention: Convention = "opengl"
-) -> NDArray[np.float32]:
+def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl") -> Singles:
     """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero where there is no normal.
 
     Args:
@@ -83,7 +81,7 @@ def read_normal_map(
     return normals
 
 
-def read_ground_truth(path: StrPath, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], bool]:
+def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Singles, bool]:
     """Return ground truth (H, W, 3) float32, and whether its rows were turned upside down.
 
     Vectors have unit length, or are zero outside the mask and where there is no ground truth. Rows of text are turned
@@ -136,7 +134,7 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
     return _Stored(values, alpha, suffix != ".mat" and values.dtype.kind == "u")
 
 
-def _read_text(path: Path, height: int, width: int) -> NDArray[np.float64]:
+def _read_text(path: Path, height: int, width: int) -> Doubles:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
     most = 3 * height * width * _LONGEST_NUMBER + MOST_TEXT
     check_length(path, most, "a normal map")
@@ -155,9 +153,7 @@ def _read_text(path: Path, height: int, width: int) -> NDArray[np.float64]:
     return rows.reshape(height, width, 3)
 
 
-def _to_normals(
-    stored: _Stored, mask: NDArray[np.bool_], path: Path, *, check_floats: bool = False
-) -> NDArray[np.float32]:
+def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False) -> Singles:
     """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are no normals.
 
     With check_floats, floating-point values must have about unit length, too, as colours must.
@@ -181,7 +177,7 @@ def _to_normals(
     return normals
 
 
-def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
+def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     """Raise InputError for colours or vectors (H, W, 3) that are no directions, such as those of a photograph."""
     vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float64)
     if stored.dtype.kind == "u":
@@ -201,7 +197,7 @@ def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) ->
         )
 
 
-def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
+def read_depth(path: Path, expected: ExpectedSize) -> Doubles:
     """Return a depth map (H, W) float64, NaN where it is not finite: there, nothing is known.
 
     Raises:
@@ -212,7 +208,7 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
     suffix = path.suffix.lower()
     with damage_as_input_error(path, "the depth map is damaged and cannot be read"):
         if suffix == ".npy":
-            stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+            stored: Array = np.lib.format.open_memmap(path, mode="r")
             check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
         else:
             stored = (_read_exr if suffix == ".exr" else decode_image)(path, expected)
@@ -227,7 +223,7 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
     return depth
 
 
-def _read_exr(path: Path, expected: ExpectedSize) -> NDArray[Any]:
+def _read_exr(path: Path, expected: ExpectedSize) -> Array:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
     with native_stderr():

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import JPEG, PNG, TIFF
 from splinecli.capture.paths import check_file, is_substitution, reading
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
@@ -45,7 +45,7 @@ class NumberRows:
     rows: tuple[Row, ...] = field(repr=False)
     names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
 
-    def as_array(self) -> NDArray[np.float64]:
+    def as_array(self) -> Doubles:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
         lengths = [len(row.numbers) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]

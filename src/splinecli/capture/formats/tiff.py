@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import COPY_AGAIN, damage_as_input_error
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Array
 from splinecli.system.memory import is_out_of_memory
 
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
@@ -26,7 +26,7 @@ _PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
-def decode_tiff(file: BinaryIO, path: Path) -> NDArray[Any] | None:
+def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
     """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one that OpenCV decodes.
 
     Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
@@ -83,12 +83,12 @@ def _check_tags(file: BinaryIO) -> None:
             raise ValueError
 
 
-def _decode_page(page: Any) -> NDArray[Any] | None:
+def _decode_page(page: Any) -> Array | None:
     """Return pixels (H, W) or (H, W, samples); None where tifffile has no decoder or fails."""
     if int(page.photometric) == _YCBCR:
         return None
     try:
-        pixels: NDArray[Any] = page.asarray()
+        pixels: Array = page.asarray()
     except Exception as error:  # the type of the error for a missing codec depends on tifffile's version
         if is_out_of_memory(error):
             raise

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.matlab import read_matrices
 from splinecli.capture.formats.text import MOST_TEXT, NumberRows, Row, check_length, read_text
 from splinecli.errors import InputError
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Doubles
 
 SUFFIXES = (".npy", ".mat", ".yml", ".yaml", ".xml")
 
@@ -48,7 +47,7 @@ def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
     return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
 
 
-def _choose(matrices: Mapping[str, Array], path: Path, n_images: int | None) -> Array:
+def _choose(matrices: Mapping[str, Doubles], path: Path, n_images: int | None) -> Doubles:
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
     lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
     if len(lights) > 1:
@@ -72,10 +71,10 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
         raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
 
 
-def _read_opencv(path: Path) -> dict[str, Array]:
+def _read_opencv(path: Path) -> dict[str, Doubles]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
     text = read_text(path).decode(errors="replace")
-    found: dict[str, Array] = {}
+    found: dict[str, Doubles] = {}
     for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
         try:
             numbers = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Doubles
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
@@ -20,9 +20,7 @@ _REDRAWS = 1000
 _INDEX = re.compile(r"[0-9]{1,9}")
 
 
-def draw_lights(
-    light_directions: NDArray[np.float64], n_lights: int | None, *, trials: int = 1, seed: int = 0
-) -> list[Draw]:
+def draw_lights(light_directions: Doubles, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
     """Return random draws of lights without replacement, each in rising order.
 
     Trial t depends only on the seed, the number of lights, `n_lights` and t. So captures with equally many lights get
@@ -69,7 +67,7 @@ class DrawsFile:
     def n_lights(self) -> int:
         return len(self.draws[0])
 
-    def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
+    def check_against(self, light_directions: Doubles, *, skipped: int = 0) -> None:
         """Raise InputError, with the line, for a draw that does not fit a capture under these lights (F, 3).
 
         No draw may name the first `skipped` lights.
@@ -105,7 +103,7 @@ def read_draws(path: Path) -> DrawsFile:
     return DrawsFile(path, tuple(draws), tuple(lines))
 
 
-def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed: int) -> Draw:
+def _draw(light_directions: Doubles, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(_REDRAWS):
         # Uniform numbers, not Generator.choice: NumPy is more likely to keep this stream in later versions.

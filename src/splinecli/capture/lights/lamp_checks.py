@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.capture.lights.array_files import SUFFIXES as ARRAY_SUFFIXES
@@ -12,6 +11,7 @@ from splinecli.capture.lights.named_lights import SUFFIXES as NAMED_SUFFIXES
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.paths import is_substitution
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools
 
 NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
 
@@ -32,7 +32,7 @@ UNIT_HINT = (
 )
 
 
-def check_distances(lamps: NearLamps, mask: NDArray[np.bool_], positions: Path | None) -> list[CaptureWarning]:
+def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
     """Warn of lamps that are hardly possible over an object with this mask (H, W), from a file of positions, if any.
 
     Raises InputError where a lamp would be inside the object, or in front of it.
@@ -50,7 +50,7 @@ def check_distances(lamps: NearLamps, mask: NDArray[np.bool_], positions: Path |
     return []
 
 
-def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]) -> list[CaptureWarning]:
+def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools) -> list[CaptureWarning]:
     """Warn that lights count as distant over a mask (H, W), although a file has their positions.
 
     The lamps of the file are None where their scale is unknown.

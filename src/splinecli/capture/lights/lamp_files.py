@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import read_lines, read_number_rows, to_number
 from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
@@ -17,6 +16,7 @@ from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Bools, Doubles
 from splinecli.maths.normals import unit
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class LampFiles:
     distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
     pixel_size: float | None
     object_width: float | None
-    camera_matrix: NDArray[np.float64] | None  # (3, 3), or None for an orthographic camera
+    camera_matrix: Doubles | None  # (3, 3), or None for an orthographic camera
     lobes: Path | None  # the file of the lamps' lobes, or None
     stamp: tuple[Any, ...]  # of the files that were found, from before they were read
     used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
@@ -95,7 +95,7 @@ class LampFiles:
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
         return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
-    def over(self, source: CaptureSource, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
+    def over(self, source: CaptureSource, mask: Bools, *, step: int = 1) -> NearLamps | None:
         """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
         window, frame, equal = source.window, source.light_frame, not source.intensities_measured
         if self.positions is not None:
@@ -162,7 +162,7 @@ def _path(name: str | None) -> Path | None:
     return None if name is None else Path(name)
 
 
-def read_camera_matrix(path: Path) -> NDArray[np.float64]:
+def read_camera_matrix(path: Path) -> Doubles:
     """Return the 3 x 3 numbers of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
@@ -171,7 +171,7 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     return matrix
 
 
-def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -> NDArray[np.float64]:
+def _read_lobes(path: Path, positions: Doubles, frame: LightFrame) -> Doubles:
     """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
     hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
     rows = read_number_rows(path).rows

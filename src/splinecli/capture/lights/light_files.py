@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import DECIMAL_POINT, NumberRows, columns, has_decimal_commas, read_number_rows
 from splinecli.capture.lights.array_files import SUFFIXES, read_array_file
@@ -24,6 +23,8 @@ from splinecli.capture.lights.light_rows import (
 )
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles
+from splinecli.maths.normals import unit
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
 _FILE = "a text file with a line {} for each image"
@@ -31,7 +32,7 @@ _FILE = "a text file with a line {} for each image"
 
 def read_light_directions(
     path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Return unit light directions (F, 3) float64 from a text file or an .npy file, in the order of the file.
 
     A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the columns in another
@@ -59,7 +60,7 @@ def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberR
     return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
 
 
-def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
+def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Doubles:
     """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
 
     Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
@@ -74,9 +75,7 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
     return positions
 
 
-def lights_of(
-    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lights_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> tuple[Doubles, Doubles]:
     """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
     if form == "xyz":
@@ -93,8 +92,8 @@ def lights_of(
 
 
 def unit_directions(
-    vectors: NDArray[np.float64], path: Path, lines: Sequence[int | None], places: Sequence[str], lamps: bool = False
-) -> NDArray[np.float64]:
+    vectors: Doubles, path: Path, lines: Sequence[int | None], places: Sequence[str], lamps: bool = False
+) -> Doubles:
     """Return vectors (F, 3) at unit length.
 
     Args:
@@ -108,8 +107,7 @@ def unit_directions(
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # First divide by the largest component, because squares of very large or small ones leave float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
+    directions = unit(scaled)
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
@@ -128,7 +126,7 @@ def unit_directions(
     return directions
 
 
-def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
+def read_light_intensities(path: StrPath, n_images: int) -> Doubles:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
@@ -178,9 +176,7 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
 
 
-def _one_light_a_row(
-    table: NumberRows, names: dict[int, str], what: str, n_images: int | None
-) -> tuple[NDArray[np.float64], bool]:
+def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_images: int | None) -> tuple[Doubles, bool]:
     """Return the numbers with one light in each row, and whether the file has one light in each column.
 
     `names` has the possible counts of numbers for a light, each with its meaning.
@@ -203,6 +199,6 @@ def _one_light_a_row(
     raise InputError(problem, path=table.path, hint=hint)
 
 
-def rows_text(values: NDArray[np.float64]) -> str:
+def rows_text(values: Doubles) -> str:
     """Return rows of numbers (F, C) as the lines of a light file."""
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
-
-Array = NDArray[np.float64]
+from splinecli.maths.arrays import Doubles, Floats
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
 
@@ -42,8 +41,8 @@ class Factors:
 
     # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
     # matrices is one between images, as a share of the mean brightness
-    matrix: Array
-    image_residuals: Array  # (F,), the root mean square of what the factors do not explain of each image, in this unit
+    matrix: Doubles
+    image_residuals: Doubles  # (F,), root mean squares of what the factors do not explain of each image, in this unit
     intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
@@ -55,7 +54,7 @@ class Factors:
         """Return the factors of the same observations, to be compared with lights of any intensities."""
         return replace(self, intensities_known=False)
 
-    def misfits(self, light_directions: Array) -> Array:
+    def misfits(self, light_directions: Doubles) -> Doubles:
         """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
         if self.intensities_known:
             return self.distances(np.linalg.qr(light_directions)[0])
@@ -63,18 +62,18 @@ class Factors:
         differences = self.matrix.T - intensities[..., None] * matrices
         return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
 
-    def distances(self, bases: Array) -> Array:
+    def distances(self, bases: Doubles) -> Doubles:
         """Return the root mean square distances (N,) from the images that orthonormal bases (N, F, 3) can explain."""
         explained = ((self.matrix @ bases) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
 
-    def intensities(self, light_directions: Array) -> Array:
+    def intensities(self, light_directions: Doubles) -> Doubles:
         """Return the intensities (N, F) that fit lights (N, F, 3) best; ones where they are known."""
         if self.intensities_known:
             return np.ones(light_directions.shape[:2])
         return self._fit_intensities(light_directions)[0]
 
-    def _fit_intensities(self, light_directions: Array) -> tuple[Array, Array]:
+    def _fit_intensities(self, light_directions: Doubles) -> tuple[Doubles, Doubles]:
         """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
         # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
         prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
@@ -90,7 +89,7 @@ class Factors:
         return intensities, matrices
 
 
-def find_factors(observations: NDArray[np.floating], *, intensities_known: bool = True) -> Factors | None:
+def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
     """Return the factors of observations (P, F), or None where there are too few lit ones.
 
     Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
@@ -118,7 +117,7 @@ def find_factors(observations: NDArray[np.floating], *, intensities_known: bool 
     return Factors(scale @ matrix, residuals, intensities_known)
 
 
-def random_misfits(factors: Factors, light_directions: Array) -> Array:
+def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
     """Return the misfits of the lights (F, 3) in random orders, in rising order."""
     given = np.tile(np.arange(len(light_directions)), (RANDOM_ORDERS, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)
@@ -144,7 +143,7 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
     return orders
 
 
-def fit_residual(values: Array, light_directions: Array) -> float:
+def fit_residual(values: Doubles, light_directions: Doubles) -> float:
     """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3).
 
     It is a share of the mean of the lit values.
@@ -155,13 +154,13 @@ def fit_residual(values: Array, light_directions: Array) -> float:
     return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
 
 
-def sample_pixels(observations: NDArray[np.floating]) -> Array:
+def sample_pixels(observations: Floats) -> Doubles:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
     for share in DARK_SHARES:
         _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
-        kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+        kept: Doubles = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
             break
     return kept

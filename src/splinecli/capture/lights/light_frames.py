@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
+from splinecli.maths.arrays import Doubles
 
 AXIS_WORDS = {
     "x-right": (0, 1),
@@ -31,7 +31,7 @@ class LightFrame:
     exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Doubles:
         """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the camera."""
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
         return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])

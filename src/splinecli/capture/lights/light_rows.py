@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
 """The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
@@ -30,7 +30,7 @@ _ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
 
 
-def directions_from_angles(angles_deg: NDArray[np.float64], form: RowForm) -> NDArray[np.float64]:
+def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:
     """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
 
     Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
@@ -65,7 +65,7 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
 
 
-def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:
+def zenith_as_elevation(light_directions: Doubles) -> Doubles:
     """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
     across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
@@ -88,7 +88,7 @@ def refuse_angles(table: NumberRows) -> None:
         raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
 
 
-def _have_one_radius(rows: NDArray[np.float64]) -> bool:
+def _have_one_radius(rows: Doubles) -> bool:
     """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
     azimuth, elevation, radius = rows.T
     all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()

@@ -13,16 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
 from splinecli.capture.lights.light_files import lights_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Doubles
 from splinecli.system.files import parse_json
-
-Array = NDArray[np.float64]
 
 SUFFIXES = (".lp", ".json")
 _MOST_DIGITS = 9  # of the number of lights
@@ -35,8 +33,8 @@ class NamedLights:
     path: Path
     names: tuple[str, ...]  # names of the images, without folders
     lines: tuple[int | None, ...]  # the line of each light in the file; None for each where the file has no lines
-    directions: NDArray[np.float64]  # (F, 3) float64, unit; x right, y up, z to the camera
-    intensities: NDArray[np.float64] | None = None  # (F, 3) float64, RGB, or None where the file has none
+    directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
+    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None where the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
@@ -69,7 +67,7 @@ class NamedLights:
 
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
-) -> NamedLights | Array:
+) -> NamedLights | Doubles:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
     The frame of a JSON file is relative to AliceVision's, which has y down and z away. Raises InputError; see

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import angle_between_deg
-
-Floats = NDArray[np.float64]
 
 _LEAST_SHARE = 0.05
 """Least intensity of a lobe. Observations are divided by it, and so is their noise. Outside, a pixel looks shadowed."""
@@ -30,17 +29,17 @@ class NearLamps:
         InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
     """
 
-    positions: Floats  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
+    positions: Doubles  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
     pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
     middle: tuple[float, float]  # row and column of the origin, in pixels of what was read
     # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
-    reference_distances: Floats
-    camera_matrix: Floats | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
-    points: NDArray[np.float32] | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
+    reference_distances: Doubles
+    camera_matrix: Doubles | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    points: Singles | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
     # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
     # is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
     # lamps that shine alike in all directions
-    lobes: Floats | None = None
+    lobes: Doubles | None = None
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
@@ -53,13 +52,13 @@ class NearLamps:
     @classmethod
     def of(
         cls,
-        positions: Floats,
+        positions: Doubles,
         pixel_size: float,
         shape: tuple[int, ...],
         *,
         equal: bool,
-        camera_matrix: Floats | None = None,
-        lobes: Floats | None = None,
+        camera_matrix: Doubles | None = None,
+        lobes: Doubles | None = None,
     ) -> NearLamps:
         """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
@@ -75,7 +74,7 @@ class NearLamps:
         middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
 
-    def within(self, left: float, top: float, step: int, camera_matrix: Floats | None) -> NearLamps:
+    def within(self, left: float, top: float, step: int, camera_matrix: Doubles | None) -> NearLamps:
         """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
         middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
         return replace(self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix)
@@ -91,7 +90,7 @@ class NearLamps:
             "lobes": None if self.lobes is None else self.lobes.round(4).tolist(),
         }
 
-    def turned(self, directions: Floats) -> NearLamps:
+    def turned(self, directions: Doubles) -> NearLamps:
         """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
         distances = np.linalg.norm(self.positions, axis=1, keepdims=True)
         return replace(self, positions=directions * distances)
@@ -102,23 +101,23 @@ class NearLamps:
         lobes, distances = None if self.lobes is None else self.lobes[chosen], self.reference_distances[chosen]
         return replace(self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes)
 
-    def choose_pixels(self, rows: slice | NDArray[np.integer]) -> NearLamps:
+    def choose_pixels(self, rows: slice | Integers) -> NearLamps:
         """Return the lamps with the surface in some of the pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
-    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Floats:
+    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Doubles:
         """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
         middle_row, middle_column = self.middle
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 
-    def extent(self, mask: NDArray[np.bool_]) -> tuple[tuple[float, float], Floats]:
+    def extent(self, mask: Bools) -> tuple[tuple[float, float], Doubles]:
         """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on the mean plane."""
         rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
         width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
-    def angles_across_deg(self, mask: NDArray[np.bool_]) -> Floats:
+    def angles_across_deg(self, mask: Bools) -> Doubles:
         """Return for each lamp (F,) how far its direction differs, at most, from that at the middle of the object.
 
         Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
@@ -128,7 +127,7 @@ class NearLamps:
         directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
         return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
 
-    def light_at(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def light_at(self, points: Floats) -> tuple[Singles, Singles]:
         """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).
 
         A strength is the inverse square of the distance, relative to the light at the lamp's reference distance, times
@@ -141,7 +140,7 @@ class NearLamps:
         return towards, strengths if self.lobes is None else strengths * _within_lobes(self.lobes, towards)
 
 
-def _within_lobes(lobes: Floats, towards: NDArray[np.floating]) -> NDArray[np.float32]:
+def _within_lobes(lobes: Doubles, towards: Floats) -> Singles:
     """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
     return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=_LEAST_SHARE)

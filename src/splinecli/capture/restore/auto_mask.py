@@ -1,14 +1,14 @@
 """A mask made from the images: the largest area that is brighter than the background."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.maths.arrays import Bools, Singles
 
 _SMALLEST, _LARGEST = 0.005, 0.98  # smallest and largest share of the picture that an object can cover
 
 
-def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
+def find_object(brightness: Singles) -> Bools:
     """Return the mask (H, W) of an object before a darker background.
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import fit_robustly, lit_values, shade, shadow_weights
+from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import unit
 
-Array = NDArray[np.float64]
-Lights = Array | Callable[[NDArray[np.integer]], Array]
+Lights = Doubles | Callable[[Integers], Doubles]
 
 MIN_LIGHTS = 6
 """Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
@@ -49,9 +49,7 @@ _STEP = 1.5  # exponent of each round's change; beyond 1 it saves a third of the
 _CONVERGED = 1e-4  # change of the logarithms
 
 
-def estimate_light_intensities(
-    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, lights: Lights
-) -> Array | None:
+def estimate_light_intensities(observations: Singles, missing: Bools | None, lights: Lights) -> Doubles | None:
     """Return light intensities (F,) with a mean of 1, or None where equal ones fit or the images do not determine them.
 
     Args:
@@ -76,9 +74,7 @@ def estimate_light_intensities(
     return intensities if error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR) else None
 
 
-def _choose_pixels(
-    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]] | None:
+def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArray[np.intp], Doubles, Bools] | None:
     """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them count.
 
     Returns None for too few.
@@ -92,7 +88,7 @@ def _choose_pixels(
     return (chosen[enough], values[enough], known[enough]) if enough.sum() >= _MIN_PIXELS else None
 
 
-def _alternate(values: Array, known: NDArray[np.bool_], lights: Array) -> Array | None:
+def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None:
     """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
     intensities = np.ones(values.shape[1])
     for _ in range(_MAX_ROUNDS):
@@ -102,7 +98,7 @@ def _alternate(values: Array, known: NDArray[np.bool_], lights: Array) -> Array 
         if (counts.sum(axis=0) < _MIN_PIXELS_PER_LIGHT).any():
             return None
         ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
-        medians: Array = np.nanmedian(ratios, axis=0)
+        medians: Doubles = np.nanmedian(ratios, axis=0)
         if not (medians > 0).all():
             return None
         before, intensities = intensities, intensities * (medians / intensities) ** _STEP
@@ -113,7 +109,7 @@ def _alternate(values: Array, known: NDArray[np.bool_], lights: Array) -> Array 
     return intensities
 
 
-def _likeliest_tilt(intensities: Array, normals: Array, lights: Array) -> Array:
+def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> Doubles:
     """Return the intensities (F,) that explain the same images of a flat object with its likeliest tilt.
 
     Under a tilt t, a plane that shows k_f needs intensities k_f / l_f . (t, 1). The likeliest tilt leaves intensities
@@ -134,7 +130,7 @@ def _likeliest_tilt(intensities: Array, normals: Array, lights: Array) -> Array:
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 
-def _fit(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Array) -> Array:
+def _fit(values: Doubles, known: Bools, intensities: Doubles, lights: Doubles) -> Doubles:
     """Return the scaled normals (p, 3) of matte pixels with these observations, for lights (F, 3) or (p, F, 3)."""
     observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
@@ -143,7 +139,7 @@ def _fit(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Ar
     return np.asarray(normals * largest)
 
 
-def _error(observed: Array, predicted: NDArray[np.floating], known: NDArray[np.bool_]) -> float:
+def _error(observed: Doubles, predicted: Floats, known: Bools) -> float:
     """Return the median of |observed - predicted|, as a share of each pixel's brightest prediction."""
     shares = np.abs(observed - predicted) / np.maximum(predicted.max(axis=1, keepdims=True), 1e-12)
     return float(np.median(shares[known]))

@@ -11,16 +11,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
 from splinecli.capture.robust_fit import fit_robustly, lit_values
 from splinecli.errors import UsageError
+from splinecli.maths.arrays import Doubles, Floats, Singles
 from splinecli.maths.normals import angle_between_deg, unit
-
-Array = NDArray[np.float64]
 
 LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
 
@@ -57,8 +55,8 @@ _CONVERGED = 1e-4
 class LightFit(NamedTuple):
     """Lights that fit the images best near given ones."""
 
-    directions: Array  # (F, 3), unit
-    intensities: Array  # (F,), relative to those of the observations
+    directions: Doubles  # (F, 3), unit
+    intensities: Doubles  # (F,), relative to those of the observations
     # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
     # observation
     before: float
@@ -106,9 +104,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     )
 
 
-def would_refine(
-    observations: NDArray[np.floating], factors: Factors | None, light_directions: Array
-) -> LightFit | None:
+def would_refine(observations: Floats, factors: Factors | None, light_directions: Doubles) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
     It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
@@ -147,8 +143,8 @@ def check_light_error(error_deg: float | None, *, refines: bool) -> None:
 
 
 def refine_lights(
-    observations: NDArray[np.float32],
-    light_directions: Array,
+    observations: Singles,
+    light_directions: Doubles,
     *,
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
@@ -171,9 +167,9 @@ def refine_lights(
 
 
 def fit_near(
-    observations: NDArray[np.float32],
-    light_directions: Array,
-    error_deg: float | Array,
+    observations: Singles,
+    light_directions: Doubles,
+    error_deg: float | Doubles,
     *,
     intensity_error: float,
     worth_pixels: float,
@@ -209,7 +205,7 @@ def fit_near(
     return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
 
 
-def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
+def _choose_pixels(observations: Singles) -> Doubles | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
     if observations.shape[1] < MIN_LIGHTS:
         return None
@@ -217,11 +213,11 @@ def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 
-def _misfit(values: Array, normals: Array, lights: Array, lit: Array) -> float:
+def _misfit(values: Doubles, normals: Doubles, lights: Doubles, lit: Doubles) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
 
 
-def _prior(light_directions: Array, error_deg: float | Array, intensity_error: float) -> Array:
+def _prior(light_directions: Doubles, error_deg: float | Doubles, intensity_error: float) -> Doubles:
     """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
     along = light_directions[:, :, None] * light_directions[:, None, :]
     # The angle has two components, each with half of its variance.
@@ -230,8 +226,14 @@ def _prior(light_directions: Array, error_deg: float | Array, intensity_error: f
 
 
 def _move_lights(
-    values: Array, normals: Array, weights: Array, lights: Array, given: Array, precision: Array, worth_pixels: float
-) -> Array:
+    values: Doubles,
+    normals: Doubles,
+    weights: Doubles,
+    lights: Doubles,
+    given: Doubles,
+    precision: Doubles,
+    worth_pixels: float,
+) -> Doubles:
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()

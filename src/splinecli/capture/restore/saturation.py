@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from functools import reduce
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, shade, shadow_weights
+from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
 
 ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 
@@ -19,26 +18,24 @@ MAX_BRIGHTENING = 8.0  # no observation is restored to more than this many times
 
 _TILE_PIXELS = 8192
 
-LightsOf = Callable[[NDArray[np.integer]], NDArray[np.float64]]
+LightsOf = Callable[[Integers], Doubles]
 """From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
 pixel shows."""
 
 
-def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
+def find_saturated(pixels: Array) -> Bools:
     """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels have none."""
     if pixels.dtype.kind != "u":
         return np.zeros(len(pixels), np.bool_)
     return in_any_channel(pixels == np.iinfo(pixels.dtype).max)
 
 
-def in_any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def in_any_channel(flags: Bools) -> Bools:
     """Return flags.any(axis=1) of flags (P, C), C at most 3, several times as fast."""
     return np.asarray(reduce(np.logical_or, flags.T))
 
 
-def restore_saturated(
-    observations: NDArray[np.float32], saturated: NDArray[np.bool_], lights: NDArray[np.float64] | LightsOf
-) -> NDArray[np.bool_] | None:
+def restore_saturated(observations: Singles, saturated: Bools, lights: Doubles | LightsOf) -> Bools | None:
     """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
 
     A saturated observation was at least as bright as stored. Its estimate is the prediction of a robust Lambertian fit
@@ -60,9 +57,7 @@ def restore_saturated(
     return saturated & ~everywhere[:, None] if len(rows) else None
 
 
-def _restored(
-    stored: NDArray[np.float32], saturated: NDArray[np.bool_], lights: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _restored(stored: Singles, saturated: Bools, lights: Singles) -> Singles:
     scale = stored.max(axis=1, keepdims=True)
     scale[scale <= 0] = 1
     values = lowest = stored / scale

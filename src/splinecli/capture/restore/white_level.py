@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.saturation import find_saturated, in_any_channel
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.arrays import Array, Bools, Integers
 
 Origin = Literal["given", "file", "images", "full scale"]
 
@@ -61,9 +62,9 @@ class ImageValues(NamedTuple):
 
     full_scale: int | None  # the largest value that the file can store; None for floating-point images
     stated: int | None  # the white level that the file states; None where it states none
-    saturated: NDArray[np.integer]  # the pixels at the given white level or above, or at full scale where none is given
+    saturated: Integers  # the pixels at the given white level or above, or at full scale where none is given
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
-    at_maximum: NDArray[np.integer] = _NOTHING  # the pixels with this value
+    at_maximum: Integers = _NOTHING  # the pixels with this value
     # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
     below: NDArray[np.int64] = _NOTHING
     counts: NDArray[np.int64] = _NOTHING  # how often each of these values occurs
@@ -77,7 +78,7 @@ class Saturation:
     images: tuple[ImageValues, ...]
     given: float | None = None  # the white level that the user gave; None to find it
     # the pixels whose observations are wanted; None for all. The level is decided from all pixels
-    rows: NDArray[np.integer] | None = None
+    rows: Integers | None = None
     even: bool = False  # whether the images show an even target, of which one image may be clipped, and all of it
 
     @property
@@ -86,7 +87,7 @@ class Saturation:
         return self._decision[0]
 
     @cached_property
-    def flags(self) -> NDArray[np.bool_] | None:
+    def flags(self) -> Bools | None:
         """The saturated observations (P, F), or None where none is saturated."""
         _, saturated = self._decision
         if not any(len(pixels) for pixels in saturated):
@@ -108,12 +109,12 @@ class Saturation:
         """Return the white level and the saturated observations that some of the images have by themselves."""
         return replace(self, images=tuple(self.images[position] for position in positions))
 
-    def choose_pixels(self, rows: NDArray[np.integer]) -> Saturation:
+    def choose_pixels(self, rows: Integers) -> Saturation:
         """Return the same white level with the observations of some pixels."""
         return replace(self, rows=rows if self.rows is None else self.rows[rows])
 
     @cached_property
-    def _decision(self) -> tuple[WhiteLevel | None, list[NDArray[np.integer]]]:
+    def _decision(self) -> tuple[WhiteLevel | None, list[Integers]]:
         saturated = [image.saturated for image in self.images]
         if self.given is not None:
             return WhiteLevel(float(self.given), "given"), saturated
@@ -160,7 +161,7 @@ class Saturation:
         return number >= SPIKE * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
-def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
+def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
     """Return what decides which of an image's pixels (P, C), as stored, are saturated.
 
     Args:
@@ -184,7 +185,7 @@ def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, sta
     return ImageValues(full_scale, stated, saturated, maximum, at_maximum, *_largest_values(pixels, maximum))
 
 
-def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:
+def _indices(flags: Bools) -> Integers:
     # Indices, not flags: few observations are saturated, and large captures have billions.
     return np.flatnonzero(flags).astype(np.int32 if len(flags) < 2**31 else np.int64)
 
