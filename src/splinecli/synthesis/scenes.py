@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -119,8 +120,7 @@ def draw_lights(count: int, rng: np.random.Generator) -> Floats:
     directions = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
     directions += rng.normal(size=(count, 3)) * np.sqrt(2 * np.pi / count) / 3
     directions[:, 2] = np.maximum(directions[:, 2], MIN_LIGHT_Z * 1.5)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions.astype(np.float32)
+    return unit(directions).astype(np.float32)
 
 
 def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -179,10 +179,10 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
         azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.float32(twist) * points[:, 2]
         radius = profile(height) * (1 + np.float32(depth) * np.cos(flutes * azimuth))
         side = (np.hypot(points[:, 0], points[:, 1]) - radius) * np.float32(0.75)
-        outer = -smooth_union(-side, half_height - np.abs(points[:, 2]), 0.08)
+        outer = smooth_cut(side, half_height - np.abs(points[:, 2]), 0.08)
         # The inside is the outside, moved inwards by the wall, and open at the top.
-        inner = -smooth_union(-(side + wall), points[:, 2] - floor, 0.25)
-        shape = -smooth_union(-outer, inner, 0.03)
+        inner = smooth_cut(side + wall, points[:, 2] - floor, 0.25)
+        shape = smooth_cut(outer, inner, 0.03)
         for extra in extras:
             shape = smooth_union(shape, extra(points), 0.04)
         return shape - folds(points) if folds else shape
