@@ -1,6 +1,5 @@
 """An evaluation as one HTML file that needs no other file: to mail, to print, or to keep."""
 
-import base64
 import struct
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -20,7 +19,7 @@ from splinecli.evaluation.statistics import (
     trial_averages,
 )
 from splinecli.evaluation.tables import best_cells, table_rows
-from splinecli.results.templates import render
+from splinecli.results.templates import picture_url, render
 
 _MOST_SENTENCES = 3  # pairs, those of three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
@@ -177,8 +176,7 @@ def _pair_row(comparison: Comparison) -> dict[str, str]:
 
 def _figure(caption: str, png: bytes) -> dict[str, Any]:
     width, height = struct.unpack(">II", png[16:24])  # from the IHDR chunk, which always comes first
-    data = base64.b64encode(png).decode("ascii")
-    return {"caption": caption, "data": data, "width": width, "height": height, "wide": width > 2 * height}
+    return {"caption": caption, "url": picture_url(png), "width": width, "height": height, "wide": width > 2 * height}
 
 
 def _signed(value_deg: float) -> str:
