@@ -123,6 +123,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     if not values.min() < 0 < values.max():
         return None
     measure = import_extra("skimage.measure", "render")
+    # The corners of a face run anticlockwise as seen from where the values are above 0, which is outside.
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
     vertices, faces = _largest_part(vertices, faces)
@@ -132,10 +133,6 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
     vertices = vertices - move[:, None] * slope
     normals = unit(gradient(field, vertices))
-    corners = vertices[faces]
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if (facing * normals[faces].sum(axis=1)).sum() < 0:
-        faces = faces[:, ::-1]
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
