@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     import torch
 
 
-def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+def choose_device(name: Device | str) -> torch.device:
     """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises UsageError."""
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
@@ -25,9 +29,7 @@ def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
-def choose_precision(
-    name: Literal["auto", "float32", "bfloat16"], device: torch.device
-) -> Literal["float32", "bfloat16"]:
+def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
     """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
     if name != "auto":
         return name
