@@ -156,8 +156,7 @@ def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
 
-def _pair_row(comparison: Comparison) -> dict[str, str]:
-    c = comparison
+def _pair_row(c: Comparison) -> dict[str, str]:
     if c.interval_deg is None or c.p_holm is None:
         interval = p_value = "not tested"
     else:
