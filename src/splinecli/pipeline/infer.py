@@ -82,7 +82,6 @@ def infer_capture(
             options.as_dict(),
             inputs_sha256(source, options.weights, loaded=loaded),
             light_file=source.files.light_directions,
-            as_stored=options.as_stored,
             distillation=None if distilled is None else distilled.report(),
         )
         further = _further_files(source, estimate, report, options, observer, clock)

@@ -163,6 +163,8 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further solids."""
+    from scipy.spatial.transform import Rotation
+
     half_height = rng.uniform(0.3, 0.75)
     wall = np.float32(rng.uniform(0.05, 0.12))
     profile = _draw_profile(rng)
@@ -191,7 +193,8 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     if mesh is None:
         return None
     tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-    return fit_to_frame(turn(mesh, _tilt(tilt, azimuth)))
+    towards_azimuth = tilt * np.array((-np.sin(azimuth), np.cos(azimuth), 0))
+    return fit_to_frame(turn(mesh, Rotation.from_rotvec(towards_azimuth).as_matrix().astype(np.float32)))
 
 
 def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
@@ -203,14 +206,6 @@ def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
         radii = np.sort(radii)
     table = PchipInterpolator(np.linspace(-1, 1, 5), radii)(np.linspace(-1, 1, 256)).astype(np.float32)
     return lambda height: np.interp(height, np.linspace(-1, 1, 256), table).astype(np.float32)
-
-
-def _tilt(angle: float, azimuth: float) -> Floats:
-    """Return the rotation that tilts +z by an angle towards an azimuth in the image."""
-    from scipy.spatial.transform import Rotation
-
-    axis = np.array((-np.sin(azimuth), np.cos(azimuth), 0))
-    return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix(), dtype=np.float32)
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {
