@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +106,7 @@ def write_estimate(
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
         for form in formats:
-            with new.open(NORMALS[form]) as file:
-                write_normals(estimate, form, file, convention)
+            new.write(NORMALS[form], encode_normals(estimate, form, convention))
         if estimate.error_map_deg is not None:
             new.write(ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
         for name, content in more:
@@ -158,25 +158,26 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
-def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], convention: Convention) -> None:
-    """Write the normal map as a 16-bit or 8-bit PNG picture, or as a float32 NPY, TIFF or EXR file.
+def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
+    """Return the file of the normal map: a 16-bit or 8-bit PNG picture, or float32 NPY, TIFF or EXR.
 
     EXR has the colours of the pictures, (n + 1) / 2 and black outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
         bits = 8 if form == "png8" else 16
         picture = encode_picture(estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention)
-        file.write(encode_png(picture, {"normals": describe(convention)}))
-    elif form == "npy":
-        np.save(file, estimate.normal_map, allow_pickle=False)
-    elif form == "exr":
+        return encode_png(picture, {"normals": describe(convention)})
+    if form == "npy":
+        return estimate.normal_map
+    if form == "exr":
         signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
         colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
-        file.write(encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"}))
-    else:
-        import tifffile
+        return encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"})
+    import tifffile
 
-        tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
+    file = io.BytesIO()
+    tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
+    return file.getvalue()
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
