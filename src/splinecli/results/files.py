@@ -87,29 +87,17 @@ class UnfinishedError(ValueError):
 
 
 def write_estimate(
-    estimate: NormalEstimate,
-    report: dict[str, Any],
-    folder: Path,
-    *,
-    formats: Sequence[str],
-    convention: Convention,
-    clock: Clock,
-    more: Iterable[tuple[str, Content]] = (),
+    report: dict[str, Any], folder: Path, files: Iterable[tuple[str, Content]], clock: Clock
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
-    The files replace those of an earlier run in the folder (see new_files), which the caller holds. The formats are
-    keys of NORMALS; `more` are names and contents of further files of OWN_FILES. Writing is the last stage of the
-    clock. Raises OutputError if a file cannot be written.
+    The files, of OWN_FILES and LIGHT_FILES, replace those of an earlier run in the folder (see new_files), which the
+    caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
-        for form in formats:
-            new.write(NORMALS[form], encode_normals(estimate, form, convention))
-        if estimate.error_map_deg is not None:
-            new.write(ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
-        for name, content in more:
+        for name, content in files:
             new.write(name, content)
         report = {
             **report,
@@ -156,6 +144,14 @@ def read_report(folder: Path) -> dict[str, Any]:
         if name in sizes and path.stat().st_size != sizes[name]:
             raise UnfinishedError(f"contains earlier results, but {name} has another size than {REPORT} states")
     return report
+
+
+def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
+    """Yield the normal map in some formats, which are keys of NORMALS, and the error map if there is one."""
+    for form in formats:
+        yield NORMALS[form], encode_normals(estimate, form, convention)
+    if estimate.error_map_deg is not None:
+        yield ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg))
 
 
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
