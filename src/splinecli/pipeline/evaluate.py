@@ -17,7 +17,7 @@ from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_li
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
-from splinecli.evaluation.document import TRIALS, make_plots, write_results
+from splinecli.evaluation.document import TRIALS, write_results
 from splinecli.evaluation.plan import distinct_names
 from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
@@ -181,7 +181,7 @@ def evaluate_captures(
         problems: list[str] = []
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-        document = write_results(output, evaluations, make_plots(evaluations), figures)
+        document = write_results(output, evaluations, figures)
     used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     untrained = [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]

@@ -61,14 +61,11 @@ class Tracer:
         found = self._scene.run(_packed(origins), _packed(directions), output=True)
         rays = (found["primID"] >= 0).nonzero()[0]
         u, v = found["u"][rays], found["v"][rays]
-        return rays, self.points(found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1))
-
-    def points(self, triangle: NDArray[np.int64], weights: Floats) -> Hits:
-        """Return the surface points with these barycentric weights (N, 3) on these triangles (N,)."""
+        triangle, weights = found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1)
         corners = self.mesh.faces[triangle]
         position = np.einsum("nk,nkc->nc", weights, self.mesh.vertices[corners])
         normal = unit(np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners]))
-        return Hits(triangle, weights, position, normal, self._facet_normals[triangle])
+        return rays, Hits(triangle, weights, position, normal, self._facet_normals[triangle])
 
     def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
         """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`.
