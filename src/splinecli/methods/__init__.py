@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 
-from splinecli.errors import UsageError
+from splinecli.errors import check_one_of
 from splinecli.methods.estimator import Estimator
 from splinecli.system.devices import Device, Precision
 
@@ -51,8 +51,7 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
 
 def check_method(name: str) -> None:
     """Raise UsageError if no method has this name. Loads nothing heavy."""
-    if name not in _METHODS:
-        raise UsageError(f"no method named {name!r}; expected one of {', '.join(_METHODS)}")
+    check_one_of("method", name, _METHODS)
 
 
 def method_names() -> list[str]:
