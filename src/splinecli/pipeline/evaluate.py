@@ -164,7 +164,7 @@ def evaluate_captures(
         raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
-    if (cluster := options.cluster and options.cluster.on_cores()) is not None:
+    if cluster := options.cluster and options.cluster.on_cores():
         elsewhere = partial(_score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:

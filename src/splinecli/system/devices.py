@@ -43,8 +43,8 @@ def choose_precision(name: Precision, device: torch.device) -> Literal["float32"
     return "bfloat16" if native else "float32"
 
 
-def use_available_cores() -> int:
-    """Limit PyTorch's threads to the cores that this process may use, and return their number.
+def use_available_cores() -> None:
+    """Limit PyTorch's threads to the cores that this process may use.
 
     Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
     may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
@@ -52,10 +52,8 @@ def use_available_cores() -> int:
     """
     import torch
 
-    threads = min(torch.get_num_threads(), count_available_cores())
-    if threads < torch.get_num_threads():
-        torch.set_num_threads(threads)
-    return threads
+    if (cores := count_available_cores()) < torch.get_num_threads():
+        torch.set_num_threads(cores)
 
 
 def count_available_cores() -> int:
