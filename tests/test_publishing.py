@@ -79,12 +79,11 @@ def test_a_failure_keeps_the_earlier_files(tmp_path: Path, monkeypatch: pytest.M
     assert content(tmp_path) == OLD
 
 
-def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splinecli.system.publishing.sync", Mock(side_effect=[None, FULL]))
     with pytest.raises(OutputError) as caught, new_files(tmp_path, report=REPORT) as new:
         new.write("b.txt", b"whole")
-        with new.open("pictures/1.png") as file:
-            file.write(b"half")
-            raise FULL
+        new.write("pictures/1.png", b"half")
     assert caught.value.path == tmp_path / "pictures" / "1.png"
     assert not list(tmp_path.iterdir())
 

@@ -217,7 +217,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
     for place, (stage, module, name) in enumerate((
         ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", estimate, "distil_for"),
         ("estimate", estimate, "estimate_normals"), ("pictures", infer, "albedo_map"),
-        ("surface", infer, "make_surface"), ("write", files, "write_normals"),
+        ("surface", infer, "make_surface"), ("write", files, "encode_normals"),
     )):  # fmt: skip
         monkeypatch.setattr(module, name, takes(10**place, getattr(module, name)))
         expected |= {stage: 10**place, "total": expected["total"] + 10**place}

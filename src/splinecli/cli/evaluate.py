@@ -80,12 +80,7 @@ def evaluate(
         help="Score trials in N processes of this machine, in place of --jobs threads (needs the extra 'cluster')."
         " auto is the number of cores.",
     ),
-    cluster: str | None = Option(
-        None,
-        metavar="ADDRESS|FILE",
-        help="Score trials on the workers of a running Dask cluster: the address of its scheduler, or its scheduler"
-        " file (needs the extra 'cluster').",
-    ),
+    cluster: str | None = Option(None, metavar="ADDRESS|FILE", help=shared.CLUSTER.format("Score trials")),
     figures: bool = Option(False, "--figures", help="Draw every method's maps for the first draw of each capture."),
     pixel: list[str] | None = Option(
         None, metavar="ROW,COLUMN", help="With --figures: show the observation maps of this pixel. May be repeated."

@@ -15,10 +15,9 @@ import typer
 
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.cli.shared import listed
-from splinecli.errors import OutputError, SplinecliError
+from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.system.memory import is_out_of_memory
 
-USAGE = 2
 DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
@@ -41,7 +40,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, SplinecliError):
         return str(error), error.exit_code
     if isinstance(error, ParserError):
-        return _usage_message(error), USAGE
+        return _usage_message(error), UsageError.exit_code
     if is_out_of_memory(error):
         return NO_MEMORY, SplinecliError.exit_code
     if isinstance(error, OSError):

@@ -109,12 +109,7 @@ def infer(
         help="Compute N captures side by side, in processes of this machine (needs the extra 'cluster'). auto chooses"
         " by cores and memory.",
     ),
-    cluster: str | None = Option(
-        None,
-        metavar="ADDRESS|FILE",
-        help="Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file"
-        " (needs the extra 'cluster').",
-    ),
+    cluster: str | None = Option(None, metavar="ADDRESS|FILE", help=shared.CLUSTER.format("Compute")),
     shard: str | None = Option(None, metavar="I/N", help="Process shard I of N: captures I, I+N, I+2N, ..."),
     as_json: bool = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else."),
     as_json_lines: bool = Option(

@@ -20,7 +20,7 @@ from typer.models import ParameterInfo
 from splinecli import __version__
 from splinecli.cli.calibrate import calibrate
 from splinecli.cli.commands import Command, Group
-from splinecli.cli.console import print_lines
+from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.evaluate import evaluate
 from splinecli.cli.failures import DEFECT, explain
 from splinecli.cli.import_weights import import_weights
@@ -31,7 +31,6 @@ from splinecli.cli.prepare import prepare
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.cli.train import train
 from splinecli.cli.watch import watch
-from splinecli.errors import printable
 
 app = typer.Typer(
     name="splinecli",
@@ -84,7 +83,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run_command(args: Sequence[str] | None) -> int:
-    command = typer.main.get_command(app)
+    command, messages = typer.main.get_command(app), Messages(quiet=False)
     try:
         result = command.main(args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False)
     except KeyboardInterrupt:
@@ -93,17 +92,12 @@ def _run_command(args: Sequence[str] | None) -> int:
         message, exit_code = explain(error)
         if message == DEFECT:
             print_lines(traceback.format_exc())
-        return fail(message, exit_code)
+        messages.error(message)
+        return exit_code
     if result == INTERRUPTED:
         TOLD.set()
-        return fail("interrupted.", INTERRUPTED)
+        messages.error("interrupted.")
     return result if isinstance(result, int) else 0
-
-
-def fail(message: str, exit_code: int) -> int:
-    """Print the message on stderr, in one line, and return the exit code."""
-    print(f"splinecli: {printable(message)}", file=sys.stderr)
-    return exit_code
 
 
 class UntilClosed:

@@ -164,6 +164,10 @@ def _of_field(value: Any, kind: str) -> Any:
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 STIFFNESS = "How easily the surface of integrate or --surface tears at edges: more with a larger number, never with 0."
+CLUSTER = (
+    "{} on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file (needs the extra"
+    " 'cluster')."
+)
 PIXEL_SIZE = "Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]"
 
 # Input and lights.

@@ -40,8 +40,8 @@ def capture_figures(
     stem: str,
     estimators: Sequence[Estimator],
     protocol: Protocol,
-    pixels: Sequence[tuple[int, int]] = (),
-    on_progress: Callable[[float], None] | None = None,
+    pixels: Sequence[tuple[int, int]],
+    advance: Callable[[float], object],
 ) -> list[CaptureFigure]:
     """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
@@ -51,14 +51,13 @@ def capture_figures(
     Args:
         name: name of the capture in the tables.
         stem: stem of the figures' file names.
-        pixels: (row, column) of the pixels whose observation maps are shown; by default those at SHOWN_PERCENTILES.
-        on_progress: called with the share of the work that was just done.
+        pixels: (row, column) of the pixels whose observation maps are shown; for none, those at SHOWN_PERCENTILES.
+        advance: called with the share of the work that was just done.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)
     trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
-    advance = on_progress or (lambda share: None)
     steps = 1 + len(estimators)
     stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps))
     capture = TrialSource(stored).see(trial)

@@ -6,7 +6,7 @@ All functions take one evaluation, or several of the same methods that differ in
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,12 @@ _DIGITS = 4  # behind the point, of degrees and seconds
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
 
-
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
-Plots = Mapping[str, tuple[str, bytes]]  # a caption and a PNG by the name of the file
 
 
-def make_plots(evaluations: Sequence[Evaluation]) -> Plots:
-    """Return the plots of the error against what the evaluations differ in; none where nothing differs."""
+def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
+    """Return plots of the error against what the evaluations differ in: captions and PNGs by the names of files."""
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
         return plots
@@ -44,13 +42,13 @@ def make_plots(evaluations: Sequence[Evaluation]) -> Plots:
 
 
 def write_results(
-    output: Path, evaluations: Sequence[Evaluation], plots: Plots, figures: Sequence[CaptureFigure] | None
+    output: Path, evaluations: Sequence[Evaluation], figures: Sequence[CaptureFigure] | None
 ) -> dict[str, Any]:
     """Write all files in place of those of an earlier evaluation (see new_files). The caller holds the folder.
 
     Without `figures`, those of an earlier evaluation stay. Returns the content of results.json.
     """
-    document = results_document(evaluations)
+    document, plots = results_document(evaluations), _make_plots(evaluations)
     shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
     texts = {
         "results.csv": results_csv(evaluations),

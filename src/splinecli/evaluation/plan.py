@@ -13,7 +13,7 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, Protocol, Result, Skipped
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore
@@ -188,12 +188,6 @@ def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
             depth += 1
         names = ["/".join(path[-depth:]) for path in parts]
     return dict(zip(folders, names, strict=True))
-
-
-def check_skip_first(protocol: Protocol, names: Sequence[str]) -> None:
-    """Raise UsageError where skip_first names a capture that does not exist."""
-    for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
-        raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
 
 
 def _nothing_scored(failures: list[SplinecliError]) -> SplinecliError:

@@ -1,6 +1,5 @@
 """An evaluation as one HTML file that needs no other file: to mail, to print, or to keep."""
 
-import base64
 import struct
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -9,18 +8,10 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import printable
+from splinecli.evaluation import statistics
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, all_captures, all_skipped, heading, lights_in_words
-from splinecli.evaluation.statistics import (
-    AVERAGE,
-    SIGNIFICANCE,
-    Comparison,
-    compare,
-    in_words,
-    p_in_words,
-    trial_averages,
-)
 from splinecli.evaluation.tables import best_cells, table_rows
-from splinecli.results.templates import render
+from splinecli.results.templates import picture_url, render
 
 _MOST_SENTENCES = 3  # pairs, those of three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
@@ -58,7 +49,7 @@ def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, 
         several_methods=len(first.methods) > 1,
         sections=[_section(evaluation) for evaluation in evaluations],
         figures=[_figure(caption, png) for caption, png in figures],
-        significance=SIGNIFICANCE,
+        significance=statistics.SIGNIFICANCE,
     )
 
 
@@ -96,13 +87,13 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
 
 
 def _section(evaluation: Evaluation) -> dict[str, Any]:
-    comparisons = compare(evaluation)
-    average = [c for c in comparisons if c.capture == AVERAGE]
+    comparisons = statistics.compare(evaluation)
+    average = [c for c in comparisons if c.capture == statistics.AVERAGE]
     return {
         "heading": heading(evaluation.protocol),
         "errors": _error_table(evaluation),
         "seconds": _seconds_table(evaluation),
-        "sentences": [in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
+        "sentences": [statistics.in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
         "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
         "pairs": [_pair_row(c) for c in comparisons],
     }
@@ -124,7 +115,7 @@ def _error_table(evaluation: Evaluation) -> Table:
     body = []
     for r, (method, *values) in enumerate(rows, start=1):
         trials = [maes_deg[method, capture] for capture in evaluation.captures]
-        trials.append(trial_averages(evaluation, method))
+        trials.append(statistics.trial_averages(evaluation, method))
         cells = [
             Cell(value, f"± {np.std(maes):.2f}" if len(maes) > 1 else "", "best" if (r, c) in best else "")
             for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
@@ -143,7 +134,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
     return [[Cell("method"), *(Cell(printable(capture)) for capture in evaluation.captures)], *body]
 
 
-def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
+def _matrix(methods: Sequence[str], comparisons: Sequence[statistics.Comparison]) -> Table:
     """Return a table of the MAE of the row's method minus that of the column's; a mark where they differ."""
     cells = {}
     for c in comparisons:
@@ -157,13 +148,12 @@ def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
 
-def _pair_row(comparison: Comparison) -> dict[str, str]:
-    c = comparison
+def _pair_row(c: statistics.Comparison) -> dict[str, str]:
     if c.interval_deg is None or c.p_holm is None:
         interval = p_value = "not tested"
     else:
         interval = " to ".join(map(_signed, c.interval_deg))
-        p_value = p_in_words(c.p_holm)
+        p_value = statistics.p_in_words(c.p_holm)
     verdict = {None: "", True: f"{c.first if c.difference_deg < 0 else c.second} is better", False: "no"}
     return {
         "capture": c.capture,
@@ -177,8 +167,7 @@ def _pair_row(comparison: Comparison) -> dict[str, str]:
 
 def _figure(caption: str, png: bytes) -> dict[str, Any]:
     width, height = struct.unpack(">II", png[16:24])  # from the IHDR chunk, which always comes first
-    data = base64.b64encode(png).decode("ascii")
-    return {"caption": caption, "data": data, "width": width, "height": height, "wide": width > 2 * height}
+    return {"caption": caption, "url": picture_url(png), "width": width, "height": height, "wide": width > 2 * height}
 
 
 def _signed(value_deg: float) -> str:

@@ -12,15 +12,8 @@ from threading import Lock
 from typing import NamedTuple
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.plan import (
-    CaptureJob,
-    ProtocolTrials,
-    check_skip_first,
-    distinct_names,
-    plan_capture,
-    read_draws_file,
-)
-from splinecli.evaluation.protocol import Evaluation, Protocol
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, distinct_names, plan_capture, read_draws_file
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, Protocol
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw
 from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator
@@ -76,7 +69,8 @@ def evaluate_all(
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
-        check_skip_first(protocol, names)
+        for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
+            raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
     store = TrialStore() if store is None else store
     planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]
     captures_to_score = [job for job in planned if job is not None]

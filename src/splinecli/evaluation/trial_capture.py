@@ -141,8 +141,7 @@ def tilt_lights(
     across = unit(across - along[:, None] * light_directions)
     sunk = np.cos(angle) * light_directions[:, 2] + np.sin(angle) * across[:, 2] <= 0
     angle = np.where(sunk, -angle, angle)[:, None]
-    tilted: NDArray[np.float64] = unit(np.cos(angle) * light_directions + np.sin(angle) * across)
-    return tilted
+    return unit(np.cos(angle) * light_directions + np.sin(angle) * across)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Literal
 
-from splinecli.errors import UsageError
+from splinecli.errors import check_one_of
 from splinecli.methods.estimator import Estimator
+from splinecli.system.devices import Device, Precision
 
 __all__ = ["DEFAULT_METHOD", "Estimator", "MethodOptions", "check_method", "make_estimator", "method_names"]
 
@@ -31,8 +31,8 @@ class MethodOptions:
     weights: str | None = None
     rotations: int | None = None
     batch_size: int | None = None
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    device: Device = "auto"
+    precision: Precision = "auto"
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
@@ -51,8 +51,7 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
 
 def check_method(name: str) -> None:
     """Raise UsageError if no method has this name. Loads nothing heavy."""
-    if name not in _METHODS:
-        raise UsageError(f"no method named {name!r}; expected one of {', '.join(_METHODS)}")
+    check_one_of("method", name, _METHODS)
 
 
 def method_names() -> list[str]:

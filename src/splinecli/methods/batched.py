@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splinecli.errors import UsageError
 from splinecli.maths.observation_map import map_scale
-from splinecli.methods.estimator import Directions, Observations
+from splinecli.methods.estimator import Directions, Observations, directions_at
 from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.system.progress import Progress
 from splinecli.system.side_by_side import side_by_side
@@ -87,16 +87,15 @@ def estimate_in_batches(
         columns: number of columns that `solve` returns. Those behind the normal are not changed.
         progress: called after each batch with the number of its pixels.
     """
-    shared = torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
     results = np.empty((len(observations), columns), np.float32)
 
     def solve_batch(start: int) -> int:
-        batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
-        own = light_directions[start : start + batch_size]
-        lights = torch.as_tensor(own, dtype=dtype, device=device) if shared is None else shared
+        rows = slice(start, start + batch_size)
+        batch = torch.as_tensor(observations[rows]).to(device, dtype)
+        lights = torch.as_tensor(directions_at(light_directions, rows), dtype=dtype, device=device)
         solved = solve(batch, lights)
         solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
-        results[start : start + batch_size] = solved.cpu().numpy()
+        results[rows] = solved.cpu().numpy()
         return len(batch)
 
     for count in side_by_side(solve_batch, range(0, len(observations), batch_size)):

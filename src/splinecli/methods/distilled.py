@@ -116,12 +116,17 @@ class DistilledEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see ConfidentEstimator."""
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
-        unlike = np.empty(len(observations), np.bool_)
+        unlike = np.empty(len(observations), np.bool_)  # the pixels that are rare, or unlike the sample
 
         def apply(rows: slice) -> slice:
-            normals[rows], errors[rows], unlike[rows] = self._apply(
-                observations[rows], directions_at(light_directions, rows)
-            )
+            own = observations[rows]
+            inputs = _inputs(self._perceptron, own, directions_at(light_directions, rows), self.device)
+            found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
+            normals[rows], errors[rows] = (values.cpu().numpy() for values in found)
+            dark = ~(own > 0).any(axis=1)
+            normals[rows][dark | ~normals[rows].any(axis=1)] = TOWARDS_CAMERA
+            errors[rows][dark] = UNKNOWN_ERROR
+            unlike[rows] = self._sample.unlike(inputs).cpu().numpy() & ~dark
             return rows
 
         tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
@@ -134,18 +139,6 @@ class DistilledEstimator:
                 observations[unlike], directions_at(light_directions, unlike), progress=progress
             )
         return normals, errors
-
-    def _apply(
-        self, observations: Observations, light_directions: Directions
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """Return the perceptron's normals and errors of some pixels, and which pixels are rare or unlike the sample."""
-        inputs = _inputs(self._perceptron, observations, light_directions, self.device)
-        found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
-        normals, errors = (values.cpu().numpy() for values in found)
-        dark = ~(observations > 0).any(axis=1)
-        normals[dark | ~normals.any(axis=1)] = TOWARDS_CAMERA
-        errors[dark] = UNKNOWN_ERROR
-        return normals, errors, self._sample.unlike(inputs).cpu().numpy() & ~dark
 
 
 def distil(

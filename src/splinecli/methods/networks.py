@@ -77,11 +77,8 @@ class NetworkEstimator:
     def for_capture(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
         """Return this estimator for the pixels of one capture, of which it has seen a sample.
 
-        Without it, the pixels of each call of `estimate` count as a capture.
-
-        Args:
-            light_of: gives the observations and the light directions of some pixels.
-            n_pixels: of the capture.
+        Without it, the pixels of each call of `estimate` count as a capture. For the arguments, see the function
+        `for_capture`.
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self

@@ -56,15 +56,13 @@ class Arrivals:
             seen = self._seen.get(path)
             if seen is None or seen.stamp != stamp:
                 seen = self._seen[path] = _Seen(stamp, self._clock())
-            if stamp[0] and not seen.returned and self._is_complete(path, seen):
-                seen.returned = True
+            if not stamp[0] or seen.returned:
+                continue
+            unchanged = self._clock() - seen.since >= self.seconds
+            seen.returned = unchanged if self.marker is None else (path / self.marker).exists()
+            if seen.returned:
                 ready.append(path)
         return sorted(ready, key=natural_key)
-
-    def _is_complete(self, path: Path, seen: _Seen) -> bool:
-        if self.marker is not None:
-            return (path / self.marker).exists()
-        return self._clock() - seen.since >= self.seconds
 
     def _subfolders(self) -> list[Path]:
         try:

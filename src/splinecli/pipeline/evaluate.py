@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_li
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
-from splinecli.evaluation.document import TRIALS, make_plots, write_results
+from splinecli.evaluation.document import TRIALS, write_results
 from splinecli.evaluation.plan import distinct_names
 from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
@@ -164,7 +164,7 @@ def evaluate_captures(
         raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
-    if (cluster := options.cluster and options.cluster.on_cores()) is not None:
+    if cluster := options.cluster and options.cluster.on_cores():
         elsewhere = partial(_score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
@@ -181,7 +181,7 @@ def evaluate_captures(
         problems: list[str] = []
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-        document = write_results(output, evaluations, make_plots(evaluations), figures)
+        document = write_results(output, evaluations, figures)
     used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     untrained = [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]
@@ -235,9 +235,11 @@ def _score_on_workers(
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
+    memory = cache(lambda folder: source_bytes(lambda: open_capture(folder)))
+    items = (Item((draw,), draw.reading.name, memory(draw.reading.folder)) for draw in draws)
     lost: LostError | None = None
     with distributor(score, output, cluster, observer) as workers:
-        for item, result in workers.run(_items(draws)):
+        for item, result in workers.run(items):
             if isinstance(result, LostError):
                 lost = result
             else:
@@ -246,29 +248,14 @@ def _score_on_workers(
         raise lost
 
 
-def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
-    folder, memory = None, 0.0
-    for draw in draws:
-        if draw.reading.folder != folder:
-            folder = draw.reading.folder
-            memory = source_bytes(lambda: open_capture(folder))  # noqa: B023 - called here
-        yield Item((draw,), draw.reading.name, memory)
-
-
 def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
     return _scorer(command, fingerprints, options).score(draw)
-
-
-@lru_cache(maxsize=1)
-def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
-    """Return the scorer of the command that this worker serves: files may change until the next command."""
-    return _Scorer(fingerprints, options)
 
 
 class _Scorer:
     """Scores draws, and keeps the last capture in memory."""
 
-    def __init__(self, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
+    def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
         self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
         for name, expected in fingerprints:
             if (found := self._estimators[name].fingerprint) != expected:
@@ -289,3 +276,6 @@ class _Scorer:
         _, source, notes = self._last
         shared = SharedDraw(source)
         return [shared.score(trial, self._estimators[trial.method]) for trial in task.trials], notes
+
+
+_scorer = lru_cache(maxsize=1)(_Scorer)  # of the command that this worker serves: files may change until the next one

@@ -82,20 +82,11 @@ def infer_capture(
             options.as_dict(),
             inputs_sha256(source, options.weights, loaded=loaded),
             light_file=source.files.light_directions,
-            as_stored=options.as_stored,
             distillation=None if distilled is None else distilled.report(),
         )
-        further = _further_files(source, estimate, report, options, observer, clock)
+        found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write")
-        return files.write_estimate(
-            estimate,
-            report,
-            target,
-            formats=options.formats,
-            convention=options.convention,
-            clock=clock,
-            more=chain.from_iterable(further),
-        )
+        return files.write_estimate(report, target, chain.from_iterable(found), clock)
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
@@ -173,7 +164,7 @@ def _check_light_files(target: Path) -> None:
             )
 
 
-def _further_files(
+def _make_files(
     source: CaptureSource,
     estimate: NormalEstimate,
     report: dict[str, Any],
@@ -181,10 +172,11 @@ def _further_files(
     observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
-    """Compute what else the options ask for, put what the report says of the surface into it, and return the files."""
+    """Compute what the options ask for, put what the report says of the surface into it, and return the files."""
     capture = estimate.capture
     found: list[Iterable[tuple[str, Content]]] = [
-        files.map_files(estimate, options.maps, options.curvature_scale, tiff="tiff" in options.formats)
+        files.normal_files(estimate, options.formats, options.convention),
+        files.map_files(estimate, options.maps, options.curvature_scale, tiff="tiff" in options.formats),
     ]
     albedo = colours = None
     clock.begin("pictures")

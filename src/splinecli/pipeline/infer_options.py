@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.layouts.capture_files import check_not_empty, list_images
@@ -29,6 +29,7 @@ from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
 from splinecli.pipeline.surface import check_pixel_size
 from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.surface.bilateral_equations import STIFFNESS
+from splinecli.system.devices import Device, Precision
 from splinecli.system.exr import check_exr
 
 
@@ -147,10 +148,6 @@ class Reading:
             window=parse_window(self.crop, self.scale),
             find_lights=find,
         )
-
-
-Device = Literal["auto", "cpu", "cuda"]
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, kw_only=True)

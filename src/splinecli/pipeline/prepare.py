@@ -1,7 +1,6 @@
 """What `prepare` does: captures with ground truth and rendered scenes become a pixel set."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -130,7 +129,7 @@ def _render_scenes(
     in_set = ((position, None) for position in positions if position not in missing)
     rendered: dict[int, str | LostError | None] = {}
     # A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
-    render = partial(_render, replace(plan), writer.folder)  # the plan without what it has read from files
+    render = partial(_render, plan, writer.folder)
     position = 0
     try:
         with distributor(render, writer.folder, cluster, observer) as workers:

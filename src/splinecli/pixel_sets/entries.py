@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -19,7 +20,7 @@ from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
-from splinecli.system.files import file_sha256, free_name, replacing
+from splinecli.system.files import file_sha256, free_name, write_bytes
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
@@ -216,8 +217,9 @@ class ScenePlan:
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
     """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
     arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
-    with replacing(path) as file:
-        np.savez(file, **arrays)
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    write_bytes(path, file.getvalue())
 
 
 def load_rendered(path: Path) -> dict[str, Pixels]:

@@ -88,17 +88,12 @@ class PixelSetSource:
     def draw(self, pixels: int) -> PixelBatch:
         """Draw a batch of P pixels."""
         truth = self._sample(pixels)
-        counts = draw_light_counts(
-            self.config.captures(pixels),
-            self.config.min_lights,
-            self.config.max_lights,
-            self.config.usual_lights,
-            self.generator,
-        )
+        config, captures = self.config, self.config.captures(pixels)
+        counts = draw_light_counts(captures, config.min_lights, config.max_lights, config.usual_lights, self.generator)
         order, valid = self._choose_lights(truth, counts)
         directions = truth.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
         radiance = truth.radiance.gather(1, order)
-        return photograph_captures(truth, radiance, directions, valid, self.config, self.generator)
+        return photograph_captures(truth, radiance, directions, valid, config, self.generator)
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return light indices (P, K) and which of them are used, from the number of each capture (G,)."""

@@ -5,8 +5,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from splinecli import __version__
 from splinecli.errors import OutputError
 from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, Entry, Pixels, PixelSet, parse_entries, read_manifest
@@ -74,9 +72,9 @@ class PixelSetWriter:
         checksums = {}
         with new_files(self.folder, report=None) as new:
             for array in ARRAYS:
-                with new.open(f"{name}/{array}.npy") as file:
-                    np.save(file, getattr(pixels, array), allow_pickle=False)
-                checksums[array] = file_sha256(Path(file.name))
+                file = f"{name}/{array}.npy"
+                new.write(file, getattr(pixels, array))
+                checksums[array] = file_sha256(new.hidden[file])
             if self._entries.pop(name, None) is not None:
                 self._write_manifest(complete=False)
         self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)

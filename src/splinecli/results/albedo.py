@@ -18,7 +18,7 @@ def albedo_map(
     source: CaptureSource,
     capture: Capture,
     normal_map: NDArray[np.float32],
-    progress: Callable[[], object] | None = None,
+    progress: Callable[[], object] = lambda: None,
 ) -> NDArray[np.float32]:
     """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
 
@@ -51,8 +51,7 @@ def albedo_map(
         total += colours
         squares += weight * cosine
         del colours
-        if progress is not None:
-            progress()
+        progress()
     albedo = np.zeros((*capture.mask.shape, 3), np.float32)
     albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
     return albedo

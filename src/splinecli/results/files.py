@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,30 +87,17 @@ class UnfinishedError(ValueError):
 
 
 def write_estimate(
-    estimate: NormalEstimate,
-    report: dict[str, Any],
-    folder: Path,
-    *,
-    formats: Sequence[str],
-    convention: Convention,
-    clock: Clock,
-    more: Iterable[tuple[str, Content]] = (),
+    report: dict[str, Any], folder: Path, files: Iterable[tuple[str, Content]], clock: Clock
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
-    The files replace those of an earlier run in the folder (see new_files), which the caller holds. The formats are
-    keys of NORMALS; `more` are names and contents of further files of OWN_FILES. Writing is the last stage of the
-    clock. Raises OutputError if a file cannot be written.
+    The files, of OWN_FILES and LIGHT_FILES, replace those of an earlier run in the folder (see new_files), which the
+    caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
-        for form in formats:
-            with new.open(NORMALS[form]) as file:
-                write_normals(estimate, form, file, convention)
-        if estimate.error_map_deg is not None:
-            new.write(ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
-        for name, content in more:
+        for name, content in files:
             new.write(name, content)
         report = {
             **report,
@@ -158,25 +146,34 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
-def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], convention: Convention) -> None:
-    """Write the normal map as a 16-bit or 8-bit PNG picture, or as a float32 NPY, TIFF or EXR file.
+def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
+    """Yield the normal map in some formats, which are keys of NORMALS, and the error map if there is one."""
+    for form in formats:
+        yield NORMALS[form], encode_normals(estimate, form, convention)
+    if estimate.error_map_deg is not None:
+        yield ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg))
+
+
+def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
+    """Return the file of the normal map: a 16-bit or 8-bit PNG picture, or float32 NPY, TIFF or EXR.
 
     EXR has the colours of the pictures, (n + 1) / 2 and black outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
         bits = 8 if form == "png8" else 16
         picture = encode_picture(estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention)
-        file.write(encode_png(picture, {"normals": describe(convention)}))
-    elif form == "npy":
-        np.save(file, estimate.normal_map, allow_pickle=False)
-    elif form == "exr":
+        return encode_png(picture, {"normals": describe(convention)})
+    if form == "npy":
+        return estimate.normal_map
+    if form == "exr":
         signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
         colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
-        file.write(encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"}))
-    else:
-        import tifffile
+        return encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"})
+    import tifffile
 
-        tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
+    file = io.BytesIO()
+    tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
+    return file.getvalue()
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:

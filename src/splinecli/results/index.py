@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from splinecli.capture.formats.image_size import image_bytes
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
-from splinecli.results.templates import render
+from splinecli.results.templates import picture_url, render
 from splinecli.system.memory import is_out_of_memory
 
 INDEX = "index.html"
@@ -105,7 +104,7 @@ def _thumbnail(path: Path) -> str | None:
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) / np.iinfo(picture.dtype).max
     done, jpeg = cv2.imencode(".jpg", np.rint(255 * small[..., ::-1]).astype(np.uint8))
-    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode('ascii')}" if done else None
+    return picture_url(jpeg.tobytes(), "jpeg") if done else None
 
 
 def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:

@@ -1,6 +1,5 @@
 """The results of one capture as one HTML file: a view under a movable light, pictures of the maps, figures."""
 
-import base64
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from splinecli.maths.normals import unit
 from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, albedo_picture, colour_errors, confidence_picture
 from splinecli.pictures.png import Picture, encode_png
-from splinecli.results.templates import render
+from splinecli.results.templates import picture_url, render
 
 LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
 LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
@@ -93,7 +92,7 @@ def result_page(
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
         error_map=error_png,
-        light_plot=None if light_plot is None else _png_url(light_plot),
+        light_plot=None if light_plot is None else picture_url(light_plot),
         error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
         error_ticks=[f"{value:g}°" for value in TICKS],
     )
@@ -168,8 +167,4 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
 
 
 def _data_url(picture: Picture) -> str:
-    return _png_url(encode_png(picture))
-
-
-def _png_url(file: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}"
+    return picture_url(encode_png(picture))

@@ -47,14 +47,13 @@ def report_of(
     inputs: str,
     *,
     light_file: Path | None,
-    as_stored: bool,
     distillation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds`, `folder` and `files`. The options are ready for JSON. `inputs` is a digest that
-    changes when an input file changes. `light_file` is None where the lights were found from the images, and
-    `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
+    write_estimate adds `seconds`, `folder` and `files`. The options are those of `infer`, ready for JSON. `inputs` is a
+    digest that changes when an input file changes. `light_file` is None where the lights were found from the images,
+    and `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
@@ -86,7 +85,7 @@ def report_of(
         "options": options,
         "inputs_sha256": inputs,
         "version": __version__,
-        "reading": name_reading(as_stored=as_stored),
+        "reading": name_reading(as_stored=options["as_stored"]),
         "white_level": None if capture.white_level is None else asdict(capture.white_level),
         "surface": None,
     }

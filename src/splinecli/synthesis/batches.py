@@ -6,15 +6,7 @@ from typing import NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.faults import (
-    add_sensor_noise,
-    disturb_light_directions,
-    disturb_light_intensities,
-    draw_exposure,
-    draw_light_intensities,
-    quantise,
-    restore,
-)
+from splinecli.synthesis import faults
 
 
 @dataclass(frozen=True)
@@ -89,15 +81,17 @@ def photograph(
 
     These are the faults of a camera and of a calibration.
     """
-    intensities = draw_light_intensities(len(radiance), radiance.shape[1], config.unequal_lights_share, generator)
+    pixels, lights = radiance.shape
+    intensities = faults.draw_light_intensities(pixels, lights, config.unequal_lights_share, generator)
     radiance = radiance * valid
-    exposure = draw_exposure(radiance * intensities, config.saturated_share, generator)
+    exposure = faults.draw_exposure(radiance * intensities, config.saturated_share, generator)
     exposed = (radiance * intensities * exposure).clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
-        exposed = quantise(add_sensor_noise(exposed, generator), config.eight_bit_share, generator)
+        exposed = faults.quantise(faults.add_sensor_noise(exposed, generator), config.eight_bit_share, generator)
     exposed = torch.where(clipped, 1, exposed)
-    observed = disturb_light_intensities(exposed * valid / intensities, config.light_intensity_error_share, generator)
-    calibrated = disturb_light_directions(directions, config.light_direction_error_share, generator)
-    restored = restore(observed, clipped & valid, calibrated, valid, generator)
-    return PixelBatch(restored, calibrated, valid, truth, exposure, len(radiance))
+    observed = exposed * valid / intensities
+    observed = faults.disturb_light_intensities(observed, config.light_intensity_error_share, generator)
+    calibrated = faults.disturb_light_directions(directions, config.light_direction_error_share, generator)
+    restored = faults.restore(observed, clipped & valid, calibrated, valid, generator)
+    return PixelBatch(restored, calibrated, valid, truth, exposure, pixels)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -94,29 +95,27 @@ def draw_wall(
     matte, with an albedo of U(0.05, 0.9).
     """
     pixels = len(normals)
+    uniform = partial(draw_uniform, generator, pixels, 1)
     spread = torch.randn(pixels, 1, generator=generator, device=generator.device) * math.radians(50)
-    facing_it = draw_uniform(generator, pixels, 1) < 0.6
+    facing_it = uniform() < 0.6
     own = torch.atan2(normals[:, 1:2], normals[:, 0:1])
-    azimuth = torch.where(facing_it, own + spread, draw_uniform(generator, pixels, 1, high=2 * math.pi))
-    present = draw_uniform(generator, pixels, 1) < share
-    height = draw_uniform(generator, pixels, 1, low=math.radians(8), high=math.radians(75)) * present
-    half_width = draw_uniform(generator, pixels, 1, low=math.radians(15), high=math.radians(88))
-    lean = draw_uniform(generator, pixels, 1, high=math.radians(60))
+    azimuth = torch.where(facing_it, own + spread, uniform(high=2 * math.pi))
+    present = uniform() < share
+    height = uniform(low=math.radians(8), high=math.radians(75)) * present
+    half_width = uniform(low=math.radians(15), high=math.radians(88))
+    lean = uniform(high=math.radians(60))
     toward = torch.cat((azimuth.cos(), azimuth.sin(), torch.zeros_like(azimuth)), dim=1)
     up = torch.tensor((0.0, 0.0, 1.0), device=normals.device)
-    same = draw_uniform(generator, pixels, 1) < 0.5
-    reflectance = (1 - height.cos()) * draw_uniform(generator, pixels, 1, low=0.5, high=2.0)
-    reflectance = reflectance * draw_uniform(generator, pixels, 1)
-    albedo = draw_uniform(generator, pixels, 1, low=0.05, high=0.9)
-    reflectance = torch.where(same, reflectance, reflectance * albedo)
-    elevation = height * draw_uniform(generator, pixels, 1, low=0.2, high=0.9)
-    elevation = torch.minimum(elevation, math.radians(85) - lean)
+    same = uniform() < 0.5
+    reflectance = (1 - height.cos()) * uniform(low=0.5, high=2.0) * uniform()
+    reflectance = torch.where(same, reflectance, reflectance * uniform(low=0.05, high=0.9))
+    elevation = torch.minimum(height * uniform(low=0.2, high=0.9), math.radians(85) - lean)
     return Wall(
         azimuth=toward,
         # Without shadows the wall lies below every light but still reflects.
         tan_height=height.tan() if shadows else torch.zeros_like(height),
         tan_half_width=half_width.tan(),
-        softness=draw_uniform(generator, pixels, 1, low=0.01, high=0.06),
+        softness=uniform(low=0.01, high=0.06),
         facing=-toward * lean.cos() + up * lean.sin(),
         reflectance=reflectance if interreflections else torch.zeros_like(reflectance),
         towards=toward * elevation.cos() + up * elevation.sin(),

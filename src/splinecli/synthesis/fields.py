@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.system.extras import import_extra
 
@@ -107,10 +108,8 @@ def ridges(rng: np.random.Generator, frequency: float) -> Field:
 
 def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
     """Return the gradient (N, 3) by central differences."""
-    columns = []
-    for axis in np.eye(3, dtype=np.float32) * np.float32(step):
-        columns.append((field(points + axis) - field(points - axis)) / np.float32(2 * step))
-    return np.stack(columns, axis=1)
+    axes = np.eye(3, dtype=np.float32) * np.float32(step)
+    return np.stack([(field(points + a) - field(points - a)) / np.float32(2 * step) for a in axes], axis=1)
 
 
 def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: float) -> Mesh | None:
@@ -124,6 +123,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     if not values.min() < 0 < values.max():
         return None
     measure = import_extra("skimage.measure", "render")
+    # The corners of a face run anticlockwise as seen from where the values are above 0, which is outside.
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
     vertices, faces = _largest_part(vertices, faces)
@@ -132,12 +132,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
     move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
     vertices = vertices - move[:, None] * slope
-    normals = gradient(field, vertices)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    corners = vertices[faces]
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if (facing * normals[faces].sum(axis=1)).sum() < 0:
-        faces = faces[:, ::-1]
+    normals = unit(gradient(field, vertices))
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
@@ -170,8 +165,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
 def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
     # Evaluate pieces that fit into the processor's cache.
-    starts = range(0, max(len(points), 1), 32_768)
-    pieces = [field(points[start : start + 32_768]) for start in starts]
+    pieces = [field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.system.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
@@ -117,5 +118,5 @@ def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = MOST_FACES
         corners = np.concatenate((corners, corners[unique].mean(axis=1)))
         quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
         faces = np.concatenate((faces[~long], *(np.stack(quarter, axis=1) for quarter in quarters)))
-    normals = corners[:, 3:] / np.maximum(np.linalg.norm(corners[:, 3:], axis=1, keepdims=True), 1e-12)
-    return Mesh(corners[:, :3].astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
+    normals = unit(corners[:, 3:]).astype(np.float32)
+    return Mesh(corners[:, :3].astype(np.float32), faces.astype(np.int32), normals)

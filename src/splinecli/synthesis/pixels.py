@@ -150,12 +150,12 @@ def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator
     return choose(one_gloss, replace(drawn.take(first), base=material.base), material)
 
 
+@dataclass(frozen=True)
 class PixelGenerator:
     """Draws batches of pixels on the device of `generator`, reproducible from its seed."""
 
-    def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
-        self.config = config
-        self.generator = generator
+    config: PixelGeneratorConfig
+    generator: torch.Generator
 
     def draw(self, pixels: int) -> PixelBatch:
         """Draw a batch of P pixels, a rig for each capture. F is the largest number of lights."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.system.extras import import_extra
 
@@ -53,24 +54,18 @@ class Tracer:
         self._scene = import_extra("embreex.rtcore_scene", "render").EmbreeScene()
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
         import_extra("embreex.mesh_construction", "render").TriangleMesh(self._scene, corners)
-        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(facing, axis=1, keepdims=True)
-        self._facet_normals = (facing / np.maximum(length, 1e-30)).astype(np.float32)
+        self._facet_normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
     def first_hits(self, origins: Floats, directions: Floats) -> tuple[NDArray[np.int64], Hits]:
         """Return the rows (K,) of the rays that hit the surface, and the K points that they hit first."""
         found = self._scene.run(_packed(origins), _packed(directions), output=True)
         rays = (found["primID"] >= 0).nonzero()[0]
         u, v = found["u"][rays], found["v"][rays]
-        return rays, self.points(found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1))
-
-    def points(self, triangle: NDArray[np.int64], weights: Floats) -> Hits:
-        """Return the surface points with these barycentric weights (N, 3) on these triangles (N,)."""
+        triangle, weights = found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1)
         corners = self.mesh.faces[triangle]
         position = np.einsum("nk,nkc->nc", weights, self.mesh.vertices[corners])
-        normal = np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        return Hits(triangle, weights, position, normal, self._facet_normals[triangle])
+        normal = unit(np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners]))
+        return rays, Hits(triangle, weights, position, normal, self._facet_normals[triangle])
 
     def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
         """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`.
@@ -169,8 +164,7 @@ def find_visible_surface(tracer: Tracer, size: int, samples: int) -> VisibleSurf
     pixel = rays // per_pixel
     whole = np.bincount(pixel, minlength=size * size) == per_pixel
     hits = hits.take(whole[pixel])
-    normals = hits.normal.reshape(-1, per_pixel, 3).mean(axis=1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(hits.normal.reshape(-1, per_pixel, 3).mean(axis=1))
     kept = normals[:, 2] > MIN_NORMAL_Z
     whole[whole] = kept
     mask = whole.reshape(size, size)

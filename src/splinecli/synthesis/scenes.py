@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -66,7 +67,8 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
-    patches = _draw_patch_count(rng)
+    kind = rng.random()
+    patches = 1 if kind < 0.6 else int(rng.integers(2, 13) if kind < 0.85 else rng.integers(20, 3001))
     one_gloss = rng.random() < 0.5
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     render_seed = int(rng.integers(2**62))
@@ -119,8 +121,7 @@ def draw_lights(count: int, rng: np.random.Generator) -> Floats:
     directions = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
     directions += rng.normal(size=(count, 3)) * np.sqrt(2 * np.pi / count) / 3
     directions[:, 2] = np.maximum(directions[:, 2], MIN_LIGHT_Z * 1.5)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions.astype(np.float32)
+    return unit(directions).astype(np.float32)
 
 
 def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -130,10 +131,3 @@ def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     seeds = centres[rng.integers(len(centres), size=patches)]
     return np.asarray(cKDTree(seeds).query(centres)[1], dtype=np.int64)
-
-
-def _draw_patch_count(rng: np.random.Generator) -> int:
-    kind = rng.random()
-    if kind < 0.6:
-        return 1
-    return int(rng.integers(2, 13)) if kind < 0.85 else int(rng.integers(20, 3001))

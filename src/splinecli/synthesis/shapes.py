@@ -10,19 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from splinecli.synthesis.fields import (
-    Field,
-    box,
-    capsule,
-    ellipsoid,
-    moved,
-    ridges,
-    smooth_cut,
-    smooth_union,
-    torus,
-    triangulate,
-    waves,
-)
+from splinecli.synthesis import fields
 from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
 
 SPACING = 0.0125
@@ -65,21 +53,21 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
 
 
-def _draw_solid(rng: np.random.Generator, size: float) -> Field:
+def _draw_solid(rng: np.random.Generator, size: float) -> fields.Field:
     kind = rng.integers(4)
     if kind == 0:
-        return ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
+        return fields.ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
     if kind == 1:
-        return box((size * rng.uniform(0.35, 1.0, 3)).astype(np.float32), 0.12 * size)
+        return fields.box((size * rng.uniform(0.35, 1.0, 3)).astype(np.float32), 0.12 * size)
     if kind == 2:
-        return torus(size * rng.uniform(0.8, 1.2), size * rng.uniform(0.2, 0.4))
-    return capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
+        return fields.torus(size * rng.uniform(0.8, 1.2), size * rng.uniform(0.2, 0.4))
+    return fields.capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
 
 
-def _place(field: Field, rng: np.random.Generator, reach: Range) -> Field:
+def _place(field: fields.Field, rng: np.random.Generator, reach: Range) -> fields.Field:
     direction = rng.normal(size=3)
     centre = direction / np.linalg.norm(direction) * rng.uniform(*reach)
-    return moved(field, draw_rotation(rng), centre.astype(np.float32))
+    return fields.moved(field, draw_rotation(rng), centre.astype(np.float32))
 
 
 Range = tuple[float, float]
@@ -87,11 +75,11 @@ Range = tuple[float, float]
 
 def _draw_waves(
     rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1, ridged: bool = False
-) -> Field:
+) -> fields.Field:
     """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its mean slope."""
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / ((4 if ridged else 2) * np.pi * frequency))
-    noise = ridges(rng, frequency) if ridged else waves(rng, frequency, outputs)
+    noise = fields.ridges(rng, frequency) if ridged else fields.waves(rng, frequency, outputs)
     return lambda points: height * noise(points)
 
 
@@ -110,12 +98,12 @@ def draw_carved(rng: np.random.Generator) -> Mesh | None:
         bent = points + bend(points)
         shape = solids[0](bent)
         for solid in solids[1:]:
-            shape = smooth_union(shape, solid(bent), blend)
+            shape = fields.smooth_union(shape, solid(bent), blend)
         for tool in tools:
-            shape = smooth_cut(shape, tool(bent), seam)
+            shape = fields.smooth_cut(shape, tool(bent), seam)
         return shape - folds(bent) if folds else shape
 
-    mesh = triangulate(distance, (1.25, 1.25, 1.25), SPACING)
+    mesh = fields.triangulate(distance, (1.25, 1.25, 1.25), SPACING)
     return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
 
 
@@ -126,7 +114,9 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
     detail = drawn(rng, (1.2, 2.4), (0.2, 0.7))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
     craters = [
-        _place(ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8))
+        _place(
+            fields.ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
+        )
         for _ in range(rng.integers(0, 9))
     ]
 
@@ -134,11 +124,11 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
         bent = points + bend(points)
         shape = np.linalg.norm(bent, axis=1) - np.float32(0.7) - swell(bent) - detail(bent)
         for crater in craters:
-            shape = smooth_cut(shape, crater(bent), 0.05)
+            shape = fields.smooth_cut(shape, crater(bent), 0.05)
         # Noise makes the field steeper. Scale it, so that it stays close to a distance.
         return np.asarray(shape * np.float32(0.7))
 
-    mesh = triangulate(distance, (1.3, 1.3, 1.3), SPACING)
+    mesh = fields.triangulate(distance, (1.3, 1.3, 1.3), SPACING)
     return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
 
 
@@ -147,7 +137,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
     swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
     pits = [_place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))]
-    slab = box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
+    slab = fields.box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
 
     def distance(points: Floats) -> Floats:
         bent = points + bend(points)
@@ -155,14 +145,16 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
         flat = bent * np.array((1, 1, 0.3), dtype=np.float32)
         shape: Floats = (bent[:, 2] - swell(flat) - folds(flat)) * np.float32(0.7)
         for pit in pits:
-            shape = smooth_cut(shape, pit(bent), 0.05)
+            shape = fields.smooth_cut(shape, pit(bent), 0.05)
         return np.maximum(shape, slab(points))
 
-    return triangulate(distance, (1.09, 1.09, 0.85), SPACING)
+    return fields.triangulate(distance, (1.09, 1.09, 0.85), SPACING)
 
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further solids."""
+    from scipy.spatial.transform import Rotation
+
     half_height = rng.uniform(0.3, 0.75)
     wall = np.float32(rng.uniform(0.05, 0.12))
     profile = _draw_profile(rng)
@@ -179,19 +171,20 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
         azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.float32(twist) * points[:, 2]
         radius = profile(height) * (1 + np.float32(depth) * np.cos(flutes * azimuth))
         side = (np.hypot(points[:, 0], points[:, 1]) - radius) * np.float32(0.75)
-        outer = -smooth_union(-side, half_height - np.abs(points[:, 2]), 0.08)
+        outer = fields.smooth_cut(side, half_height - np.abs(points[:, 2]), 0.08)
         # The inside is the outside, moved inwards by the wall, and open at the top.
-        inner = -smooth_union(-(side + wall), points[:, 2] - floor, 0.25)
-        shape = -smooth_union(-outer, inner, 0.03)
+        inner = fields.smooth_cut(side + wall, points[:, 2] - floor, 0.25)
+        shape = fields.smooth_cut(outer, inner, 0.03)
         for extra in extras:
-            shape = smooth_union(shape, extra(points), 0.04)
+            shape = fields.smooth_union(shape, extra(points), 0.04)
         return shape - folds(points) if folds else shape
 
-    mesh = triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
+    mesh = fields.triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
     if mesh is None:
         return None
     tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-    return fit_to_frame(turn(mesh, _tilt(tilt, azimuth)))
+    towards_azimuth = tilt * np.array((-np.sin(azimuth), np.cos(azimuth), 0))
+    return fit_to_frame(turn(mesh, Rotation.from_rotvec(towards_azimuth).as_matrix().astype(np.float32)))
 
 
 def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
@@ -203,14 +196,6 @@ def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
         radii = np.sort(radii)
     table = PchipInterpolator(np.linspace(-1, 1, 5), radii)(np.linspace(-1, 1, 256)).astype(np.float32)
     return lambda height: np.interp(height, np.linspace(-1, 1, 256), table).astype(np.float32)
-
-
-def _tilt(angle: float, azimuth: float) -> Floats:
-    """Return the rotation that tilts +z by an angle towards an azimuth in the image."""
-    from scipy.spatial.transform import Rotation
-
-    axis = np.array((-np.sin(azimuth), np.cos(azimuth), 0))
-    return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix(), dtype=np.float32)
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     import torch
 
 
-def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+def choose_device(name: Device | str) -> torch.device:
     """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises UsageError."""
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
@@ -25,9 +29,7 @@ def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
-def choose_precision(
-    name: Literal["auto", "float32", "bfloat16"], device: torch.device
-) -> Literal["float32", "bfloat16"]:
+def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
     """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
     if name != "auto":
         return name
@@ -41,8 +43,8 @@ def choose_precision(
     return "bfloat16" if native else "float32"
 
 
-def use_available_cores() -> int:
-    """Limit PyTorch's threads to the cores that this process may use, and return their number.
+def use_available_cores() -> None:
+    """Limit PyTorch's threads to the cores that this process may use.
 
     Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
     may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
@@ -50,10 +52,8 @@ def use_available_cores() -> int:
     """
     import torch
 
-    threads = min(torch.get_num_threads(), count_available_cores())
-    if threads < torch.get_num_threads():
-        torch.set_num_threads(threads)
-    return threads
+    if (cores := count_available_cores()) < torch.get_num_threads():
+        torch.set_num_threads(cores)
 
 
 def count_available_cores() -> int:

@@ -177,23 +177,20 @@ class NewFiles:
         """The bytes of each complete file by its name."""
         return {name: path.stat().st_size for name, path in sorted(self.hidden.items())}
 
-    @contextmanager
-    def open(self, name: str) -> Iterator[IO[bytes]]:
-        """Yield a new file to write. Its name may be that of a file in a subfolder. Raises OutputError."""
+    def write(self, name: str, content: Content) -> None:
+        """Write a new file. Its name may be that of a file in a subfolder. Raises OutputError.
+
+        An array becomes NPY, text UTF-8 with escapes for what is not valid.
+        """
         _check_place(self._folder / name, self._folder)
         with refusals_as_output_errors(self._folder / name):
             with create_hidden(self._folder) as file:
                 self.hidden[name] = Path(file.name)
-                yield file
+                if isinstance(content, np.ndarray):
+                    np.save(file, content, allow_pickle=False)
+                else:
+                    file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
             sync(self.hidden[name])
-
-    def write(self, name: str, content: Content) -> None:
-        """Write a new file. An array becomes NPY, text UTF-8 with escapes for what is not valid. Raises OutputError."""
-        with self.open(name) as file:
-            if isinstance(content, np.ndarray):
-                np.save(file, content, allow_pickle=False)
-            else:
-                file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
         """Remove the earlier files, and rename the new ones to their places, the report last. Raises OSError."""
