@@ -149,7 +149,7 @@ def read_capture(
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
     light_indices: Sequence[int] | None = None,
-    progress: Progress = lambda: None,
+    progress: Progress | None = None,
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:
@@ -157,7 +157,7 @@ def read_capture(
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
     )
-    return source.read(light_indices, progress, as_stored=as_stored)
+    return source.read(light_indices, progress or (lambda: None), as_stored=as_stored)
 
 
 def _read_lights(

@@ -68,6 +68,8 @@ class NetworkEstimator:
         refine_net = self.network.refine_net
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
+        if rotations > 1 and self.network.config.sees_capture:
+            self.fingerprint += " of the capture, too"  # trials of before, when they saw one context, do not fit
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)

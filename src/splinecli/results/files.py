@@ -99,6 +99,7 @@ def write_estimate(
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
             new.write(name, content)
+            del content  # before the next one is made
         report = {
             **report,
             "seconds": clock.seconds(),

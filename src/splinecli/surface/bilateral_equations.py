@@ -48,9 +48,8 @@ class BilateralEquations:
     """The equations of P pixels."""
 
     facing: Doubles  # (P,), zero where the normal is not usable
-    slants: tuple[
-        Doubles, Doubles
-    ]  # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    slants: tuple[Doubles, Doubles]
     # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
     # above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
@@ -164,6 +163,7 @@ class LaplacianSolver:
         diagonal = self._sum(damped, self._near) + self._sum(damped, self._far) + _DAMPING_OF_HEIGHTS + pull
         values = np.concatenate((-damped, -damped, diagonal))[self._pattern.data]
         matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
+        del damped, diagonal, values  # multigrid needs the memory
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()

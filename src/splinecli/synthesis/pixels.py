@@ -150,7 +150,7 @@ def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator
     return choose(one_gloss, replace(drawn.take(first), base=material.base), material)
 
 
-@dataclass
+@dataclass(eq=False)
 class PixelGenerator:
     """Draws batches of pixels on the device of `generator`, reproducible from its seed."""
 

@@ -31,7 +31,7 @@ FIRST_EXAMPLES = 64
 """Captures that are photographed before the first step."""
 
 STEPS_PER_EXAMPLE = 8
-"""Steps after which another one is photographed: a third of the time of training on a processor."""
+"""Steps after which another one is photographed: about a third of the time of training on a processor."""
 
 MOST_EXAMPLES = 2000
 """More replace the oldest ones. One takes about a megabyte."""
@@ -205,8 +205,11 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
         normals.cpu().numpy(),
     )
     if indirect is not None:
-        observations = torch.from_numpy(indirect.remove(observations.numpy(), np.arange(len(observations))))
-        normals, errors = _estimate(network, observations, lights)
+        rows = np.arange(len(observations))
+        changed = torch.from_numpy(indirect.counts_at(observations.numpy(), rows))[:, None].to(device)
+        observations = torch.from_numpy(indirect.remove(observations.numpy(), rows))
+        anew = _estimate(network, observations, lights)
+        normals, errors = (torch.where(changed, *both) for both in zip(anew, (normals, errors), strict=True))
     found = [
         refine_features(observations[part].to(device), lights, normals[part], errors[part], reference, signs)
         for part in _batches(len(observations))
