@@ -9,8 +9,10 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from faults.sync_order import missing_syncs, record_calls
@@ -80,10 +82,14 @@ def test_a_failure_keeps_the_earlier_files(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splinecli.system.publishing.sync", Mock(side_effect=[None, FULL]))
+    def save_half(file: IO[bytes], *_: object, **__: object) -> None:
+        file.write(b"half")
+        raise FULL
+
+    monkeypatch.setattr("splinecli.system.publishing.np.save", save_half)
     with pytest.raises(OutputError) as caught, new_files(tmp_path, report=REPORT) as new:
         new.write("b.txt", b"whole")
-        new.write("pictures/1.png", b"half")
+        new.write("pictures/1.png", np.zeros(3))
     assert caught.value.path == tmp_path / "pictures" / "1.png"
     assert not list(tmp_path.iterdir())
 

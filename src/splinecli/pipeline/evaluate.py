@@ -252,10 +252,16 @@ def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: Met
     return _scorer(command, fingerprints, options).score(draw)
 
 
+@lru_cache(maxsize=1)
+def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
+    """Return the scorer of the command that this worker serves: files may change until the next command."""
+    return _Scorer(fingerprints, options)
+
+
 class _Scorer:
     """Scores draws, and keeps the last capture in memory."""
 
-    def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
+    def __init__(self, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
         self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
         for name, expected in fingerprints:
             if (found := self._estimators[name].fingerprint) != expected:
@@ -276,6 +282,3 @@ class _Scorer:
         _, source, notes = self._last
         shared = SharedDraw(source)
         return [shared.score(trial, self._estimators[trial.method]) for trial in task.trials], notes
-
-
-_scorer = lru_cache(maxsize=1)(_Scorer)  # of the command that this worker serves: files may change until the next one

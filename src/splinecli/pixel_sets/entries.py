@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -20,7 +19,7 @@ from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
-from splinecli.system.files import file_sha256, free_name, write_bytes
+from splinecli.system.files import file_sha256, free_name, replacing
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
@@ -217,9 +216,8 @@ class ScenePlan:
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
     """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
     arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
-    file = io.BytesIO()
-    np.savez(file, **arrays)
-    write_bytes(path, file.getvalue())
+    with replacing(path) as file:
+        np.savez(file, **arrays)
 
 
 def load_rendered(path: Path) -> dict[str, Pixels]:

@@ -37,7 +37,7 @@ def albedo_map(
         cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
         counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
-    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours)
+    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
     for position, colours in enumerate(images):
         cosines, strengths = _shading(capture, normals, slice(None), [position])
         cosine = cosines[:, 0] * counts[:, position]
@@ -51,7 +51,6 @@ def albedo_map(
         total += colours
         squares += weight * cosine
         del colours
-        progress()
     albedo = np.zeros((*capture.mask.shape, 3), np.float32)
     albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
     return albedo

@@ -156,14 +156,9 @@ class LaplacianSolver:
         that of the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
-        from scipy.sparse import csr_matrix
         from scipy.sparse.linalg import cg
 
-        damped = weights + _DAMPING_OF_GAPS
-        diagonal = self._sum(damped, self._near) + self._sum(damped, self._far) + _DAMPING_OF_HEIGHTS + pull
-        values = np.concatenate((-damped, -damped, diagonal))[self._pattern.data]
-        matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
-        del damped, diagonal, values  # multigrid needs the memory
+        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
@@ -180,6 +175,13 @@ class LaplacianSolver:
         if next(steps) > _STEPS_BEFORE_RENEWAL:
             self._preconditioner = None
         return change
+
+    def _laplacian(self, weights: Doubles, pull: Doubles | float) -> Any:
+        from scipy.sparse import csr_matrix
+
+        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
+        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
+        return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 
     def _sum(self, of_pairs: Doubles, pixels: Pixels) -> Doubles:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

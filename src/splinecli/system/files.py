@@ -49,8 +49,9 @@ def made_folder(folder: Path) -> Iterator[list[Path]]:
                 place.rmdir()
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file that takes the place of `path`, so that it appears complete or not at all.
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a new file that takes the place of `path` after the block, so that it appears complete or not at all.
 
     It is written beside its place and renamed. The rename replaces a link, it does not follow it. Folders are made as
     needed. Raises OutputError.
@@ -60,13 +61,19 @@ def write_bytes(path: Path, content: bytes) -> None:
         try:
             with create_hidden(path.parent) as file:
                 temporary = Path(file.name)
-                file.write(content)
+                yield file
             sync(temporary)
             temporary.replace(path)
             sync_names(path.parent, *made)
         finally:
             if temporary is not None:  # also on Ctrl-C
                 temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file as `replacing` does. Raises OutputError."""
+    with replacing(path) as file:
+        file.write(content)
 
 
 def sync(path: Path) -> None:

@@ -197,7 +197,7 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     network.eval()
     lights = light_directions.to(device)
     signs, reference = alternating_signs(lights), brightness(observations)
-    normals, errors = _estimate(network, observations, lights)
+    normals, errors = _estimate(network, observations, lights, observations)
     indirect = find_indirect_light(
         mask.numpy(),
         observations.numpy(),
@@ -206,10 +206,11 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     )
     if indirect is not None:
         rows = np.arange(len(observations))
-        changed = torch.from_numpy(indirect.counts_at(observations.numpy(), rows))[:, None].to(device)
+        changed = torch.from_numpy(indirect.counts_at(observations.numpy(), rows))
         observations = torch.from_numpy(indirect.remove(observations.numpy(), rows))
-        anew = _estimate(network, observations, lights)
-        normals, errors = (torch.where(changed, *both) for both in zip(anew, (normals, errors), strict=True))
+        if changed.any():
+            places = changed.to(device)
+            normals[places], errors[places] = _estimate(network, observations[changed], lights, observations)
     found = [
         refine_features(observations[part].to(device), lights, normals[part], errors[part], reference, signs)
         for part in _batches(len(observations))
@@ -217,10 +218,15 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     return torch.cat(found)
 
 
-def _estimate(network: SplineNet, observations: Tensor, light_directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normals (P, 3) of a capture's pixels and the distributions (P, 2) of their errors."""
+def _estimate(
+    network: SplineNet, observations: Tensor, light_directions: Tensor, of_capture: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the normals (P, 3) of some pixels, and the distributions (P, 2) of their errors.
+
+    The pixels see a sample of their capture, whose observations `of_capture` has.
+    """
     device = light_directions.device
-    sample = observations[sample_of(observations.numpy())]
+    sample = of_capture[sample_of(of_capture.numpy())]
     context = network.look_at(sample.to(device), light_directions)
     normals, errors = [], []
     for part in _batches(len(observations)):
