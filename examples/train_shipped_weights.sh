@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about twelve hours on two cores:
+# Train the weights that come with splinecli from scratch, in about thirteen hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
