@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from splinecli.capture import Capture
 from splinecli.confidence import add_light_error, correct_errors
 from splinecli.errors import SplinecliError
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
-from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
@@ -113,11 +114,57 @@ def _estimate(
 
     Methods without confidence have no distributions.
     """
+    found = estimate_pixels(
+        capture.mask, capture.observations, partial(light_on, capture), estimator, tile_pixels, progress, stage
+    )
+    normals, errors = found.normals, found.errors
+    refiner = refiner_of(estimator)
+    if refiner is not None and errors is not None:
+        with (stage or _no_stage)("refining") as advance:
+            refiner.refine(capture.mask, capture.observations, found.light_of, normals, errors, progress=advance)
+    judged = errors is not None and correct_errors(capture, estimator, found.light_of, normals, errors)
+    if errors is not None and capture.light_errors_deg is not None:
+        add_light_error(errors, capture.light_errors_deg)
+    return normals, errors, judged
+
+
+class PixelEstimates(NamedTuple):
+    """What an estimator found, before refinement.
+
+    normals: (P, 3) float32, unit, in the capture's frame.
+    errors: (P, 2) float32, the distributions of their errors; None for methods without confidence.
+    light_of: the light of the pixels as they were seen last: without indirect light where that was removed.
+    """
+
+    normals: NDArray[np.float32]
+    errors: NDArray[np.float32] | None
+    light_of: LightOf
+
+
+def estimate_pixels(
+    mask: NDArray[np.bool_],
+    observations: NDArray[np.float32],
+    light_on: Callable[[Rows, IndirectLight | None], LampLight],
+    estimator: Estimator,
+    tile_pixels: int | None = None,
+    progress: Progress | None = None,
+    stage: Stage | None = None,
+) -> PixelEstimates:
+    """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
+
+    Only the networks with a refiner remove indirect light. The refinement net also learns from what this returns.
+
+    Args:
+        mask: (H, W), with P true pixels.
+        observations: (P, F), as they were photographed.
+        light_on: gives the light of some pixels, without this indirect light if there is any.
+        tile_pixels, progress, stage: see estimate_normals.
+    """
     if tile_pixels is None:
         tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
-    normals = np.empty((capture.n_pixels, 3), np.float32)
-    errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
-    begin = stage or (lambda _: nullcontext(lambda _: None))
+    n_pixels = len(observations)
+    normals = np.empty((n_pixels, 3), np.float32)
+    errors = np.empty((n_pixels, 2), np.float32) if tells_confidence(estimator) else None
 
     def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
         if errors is not None and tells_confidence(estimator):
@@ -126,29 +173,32 @@ def _estimate(
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)
 
-    light_of = partial(light_on, capture)
-    estimator = for_capture(estimator, light_of, capture.n_pixels)
-    for rows in parts_of_rows(capture.n_pixels, tile_pixels):
-        estimate(rows, light_of(rows), progress)
+    def seen(without: IndirectLight | None) -> LightOf:
+        return lambda rows: light_on(rows, without)
+
+    light_of = seen(None)
     refiner = refiner_of(estimator)
-    if refiner is not None and errors is not None:
-        with begin("removing indirect light") as advance:
-            indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
-            if indirect is not None:
-                light_of = partial(light_on, capture, without=indirect)
-                # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
-                estimator = see_anew(estimator, light_of, capture.n_pixels)
-                for rows in parts_of_rows(capture.n_pixels, tile_pixels):
-                    changed = rows[indirect.counts_at(capture.observations[rows], rows)]
-                    if len(changed):
-                        estimate(changed, light_of(changed))
-                    advance(len(rows))
-        with begin("refining") as advance:
-            refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
-    judged = errors is not None and correct_errors(capture, estimator, light_of, normals, errors)
-    if errors is not None and capture.light_errors_deg is not None:
-        add_light_error(errors, capture.light_errors_deg)
-    return normals, errors, judged
+    estimator = for_capture(estimator, light_of, n_pixels)
+    for rows in parts_of_rows(n_pixels, tile_pixels):
+        estimate(rows, light_of(rows), progress)
+    if refiner is None or errors is None:
+        return PixelEstimates(normals, errors, light_of)
+    with (stage or _no_stage)("removing indirect light") as advance:
+        indirect = find_indirect_light(mask, observations, light_of, normals)
+        if indirect is not None:
+            light_of = seen(indirect)
+            # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
+            estimator = see_anew(estimator, light_of, n_pixels)
+            for rows in parts_of_rows(n_pixels, tile_pixels):
+                changed = rows[indirect.counts_at(observations[rows], rows)]
+                if len(changed):
+                    estimate(changed, light_of(changed))
+                advance(len(rows))
+    return PixelEstimates(normals, errors, light_of)
+
+
+def _no_stage(_: str) -> AbstractContextManager[Progress]:
+    return nullcontext(lambda _: None)
 
 
 def light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:

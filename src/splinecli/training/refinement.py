@@ -12,12 +12,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.light.indirect_light import find_indirect_light
-from splinecli.light.lamp_light import LampLight
-from splinecli.networks.capture_context import sample_of
+from splinecli.inference import estimate_pixels
+from splinecli.light.indirect_light import IndirectLight
+from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.methods.networks import NetworkEstimator
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import LoadedNetwork
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
 from splinecli.synthesis.batches import CaptureConfig
@@ -53,8 +55,6 @@ _ENGRAVED_SIZE = 96
 
 ERROR_WEIGHT = 0.05
 """Weight of the likelihood of the errors beside the angle in radians."""
-
-_BATCH = 1024
 
 
 class SceneMaps(NamedTuple):
@@ -190,56 +190,27 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
 
 @torch.no_grad()
 def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor) -> Tensor:
-    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W), after SPLINE-Net.
-
-    As in use, the network sees the observations (P, F) a second time where indirect light could be removed.
-    """
-    device = network.cells.device
-    network.eval()
-    lights = light_directions.to(device)
-    signs, reference = alternating_signs(lights), brightness(observations)
-    normals, errors = _estimate(network, observations, lights, observations)
-    indirect = find_indirect_light(
-        mask.numpy(),
-        observations.numpy(),
-        lambda rows: LampLight(observations.numpy()[rows], light_directions.numpy()),
-        normals.cpu().numpy(),
+    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W), as they are in use."""
+    estimator = NetworkEstimator(
+        "spline-net", LoadedNetwork(network.eval(), "in training", ""), device=network.cells.device, precision="float32"
     )
-    if indirect is not None:
-        rows = np.arange(len(observations))
-        changed = torch.from_numpy(indirect.counts_at(observations.numpy(), rows))
-        observations = torch.from_numpy(indirect.remove(observations.numpy(), rows))
-        if changed.any():
-            places = changed.to(device)
-            normals[places], errors[places] = _estimate(network, observations[changed], lights, observations)
-    found = [
-        refine_features(observations[part].to(device), lights, normals[part], errors[part], reference, signs)
-        for part in _batches(len(observations))
-    ]
-    return torch.cat(found)
+    directions = light_directions.numpy()
 
+    def light_on(rows: Rows, without: IndirectLight | None) -> LampLight:
+        own = observations.numpy()[rows]
+        return LampLight(own if without is None else without.remove(own, rows), directions)
 
-def _estimate(
-    network: SplineNet, observations: Tensor, light_directions: Tensor, of_capture: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the normals (P, 3) of some pixels, and the distributions (P, 2) of their errors.
+    estimated, errors, light_of = estimate_pixels(mask.numpy(), observations.numpy(), light_on, estimator)
+    assert errors is not None, "TrainingConfig asks for an error head"
+    lights = light_directions.to(estimator.device)
+    signs, reference = alternating_signs(lights), brightness(observations)
 
-    The pixels see a sample of their capture, whose observations `of_capture` has.
-    """
-    device = light_directions.device
-    sample = of_capture[sample_of(of_capture.numpy())]
-    context = network.look_at(sample.to(device), light_directions)
-    normals, errors = [], []
-    for part in _batches(len(observations)):
-        found, error = network(observations[part].to(device), light_directions, context=context)
-        assert error is not None, "TrainingConfig asks for an error head"
-        normals.append(found)
-        errors.append(error)
-    return torch.cat(normals), torch.cat(errors)
+    def features_of(rows: Rows) -> Tensor:
+        values = light_of(rows).observations, estimated[rows], errors[rows]
+        seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
+        return refine_features(seen, lights, normals, error, reference, signs)
 
-
-def _batches(pixels: int) -> list[slice]:
-    return [slice(start, start + _BATCH) for start in range(0, pixels, _BATCH)]
+    return torch.cat([features_of(rows) for rows in parts_of_rows(len(observations))])
 
 
 def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
