@@ -115,7 +115,13 @@ def _estimate(
     Methods without confidence have no distributions.
     """
     found = estimate_pixels(
-        capture.mask, capture.observations, partial(light_on, capture), estimator, tile_pixels, progress, stage
+        capture.mask,
+        capture.observations,
+        lambda indirect, rows: light_on(capture, rows, without=indirect),
+        estimator,
+        tile_pixels,
+        progress,
+        stage,
     )
     normals, errors = found.normals, found.errors
     refiner = refiner_of(estimator)
@@ -144,7 +150,7 @@ class PixelEstimates(NamedTuple):
 def estimate_pixels(
     mask: NDArray[np.bool_],
     observations: NDArray[np.float32],
-    light_on: Callable[[Rows, IndirectLight | None], LampLight],
+    light_without: Callable[[IndirectLight | None, Rows], LampLight],
     estimator: Estimator,
     tile_pixels: int | None = None,
     progress: Progress | None = None,
@@ -157,7 +163,7 @@ def estimate_pixels(
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
-        light_on: gives the light of some pixels, without this indirect light if there is any.
+        light_without: gives the light of some pixels without indirect light, or with all that there is.
         tile_pixels, progress, stage: see estimate_normals.
     """
     if tile_pixels is None:
@@ -173,10 +179,7 @@ def estimate_pixels(
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)
 
-    def seen(without: IndirectLight | None) -> LightOf:
-        return lambda rows: light_on(rows, without)
-
-    light_of = seen(None)
+    light_of = partial(light_without, None)
     refiner = refiner_of(estimator)
     estimator = for_capture(estimator, light_of, n_pixels)
     for rows in parts_of_rows(n_pixels, tile_pixels):
@@ -186,7 +189,7 @@ def estimate_pixels(
     with (stage or _no_stage)("removing indirect light") as advance:
         indirect = find_indirect_light(mask, observations, light_of, normals)
         if indirect is not None:
-            light_of = seen(indirect)
+            light_of = partial(light_without, indirect)
             # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
             estimator = see_anew(estimator, light_of, n_pixels)
             for rows in parts_of_rows(n_pixels, tile_pixels):

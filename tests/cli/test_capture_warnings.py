@@ -1,6 +1,7 @@
 """Warnings about a capture, from the files to the messages and exit codes of `infer` and `info`."""
 
 import json
+import shutil
 import warnings
 from pathlib import Path
 
@@ -41,6 +42,35 @@ def test_shifted_images_are_named(run, medallion):
     info = run("info", medallion, "--json")
     assert words in info.err and "images_shifted" in json.loads(info.out)["warning_codes"]
     assert words.removesuffix(".") in refused(run, "--method", "ls")
+
+
+def test_the_same_file_under_two_lights(run, medallion):
+    """Each colour of the medallion has its own intensity, so equal files give unequal observations."""
+    for copy, original in (("02", "01"), ("07", "03")):
+        shutil.copy(medallion / f"{original}.png", medallion / f"{copy}.png")
+    result = run("infer", medallion, "--method", "ls")
+    words = "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove one,"
+    assert result.code == 0 and words in result.err
+    assert codes() == ["repeated_images"]
+    assert words.removesuffix(" Remove one,") in refused(run, "--method", "ls")
+
+
+def test_two_images_under_the_same_light(run, medallion):
+    lights = np.loadtxt(medallion / "light_directions.txt")
+    lights[1] = lights[0]
+    np.savetxt(medallion / "light_directions.txt", lights)
+    shutil.copy(medallion / "01.png", medallion / "02.png")
+    run("infer", medallion, "--method", "ls")
+    assert "repeated_images" not in codes()
+
+
+def test_a_black_image_is_named_without_intensities(run, medallion):
+    (medallion / "light_intensities.txt").unlink()
+    picture = cv2.imread(str(medallion / "04.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(medallion / "04.png"), 0 * picture)
+    result = run("infer", medallion, "--method", "ls")
+    assert "04.png is black. Its lamp failed." in result.err
+    assert codes() == ["image_odd"]
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,8 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     mask[8:16, 12] = 255  # a line
     cv2.imwrite("line.png", mask)
     result = run("infer", capture, "--method", "ls", "--mask", "line.png", "--surface")
-    assert (result.code, "the mesh has no triangles" in result.err) == (3, True)
+    assert (result.code, "sphere: the mesh has no triangles" in result.err) == (3, True)
+    assert "or leave --surface out" in result.err
     assert not Path("out/sphere/report.json").exists()
 
     assert run("infer", capture, "--method", "ls", "--overwrite").code == 0

@@ -25,6 +25,8 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 SAME_IMAGE = 1e-12
 """One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
 
+SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
+
 UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
 """Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
 that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
@@ -49,6 +51,10 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
+    for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
+        if largest <= 0:
+            text = f"{name} is black. Its lamp failed. Photograph it again, or leave it out."
+            return [CaptureWarning(codes.IMAGE_ODD, text)]
     odd = seen.light_check.odd_image
     if odd is None or odd.place in [shift.place for shift in seen.shifts]:
         return []
@@ -78,11 +84,18 @@ def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
 
 
 def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
-    if pairs := repeated_images(seen.sample.observations):
+    pairs = sorted({*repeated_images(seen.sample.observations), *seen.copies})
+    differ = "" if seen.found else ", but their lights differ"
+    if differ:
+        pairs = [pair for pair in pairs if angle_between_deg(*seen.directions[list(pair)]) > SAME_LIGHT_DEG]
+    if pairs:
         first, second = (seen.names[place] for place in pairs[0])
-        more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
-        text = f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by"
-        yield CaptureWarning(codes.REPEATED_IMAGES, f"{text} its own photograph.")
+        others = len(pairs) - 1
+        more = f" (and {others} more pair{'s' if others > 1 else ''})" if others else ""
+        text = (
+            f"{first} and {second} are the same image{more}{differ}. Remove one, or replace it by its own photograph."
+        )
+        yield CaptureWarning(codes.REPEATED_IMAGES, text)
 
 
 def rough_lights(seen: Evidence) -> list[CaptureWarning]:
@@ -120,18 +133,22 @@ def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.UNEQUAL_INTENSITIES, text)]
 
 
-DOUBTED = frozenset({codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED})
+REPEATED = frozenset({codes.REPEATED_IMAGES})  # where the lights differ, these contradict any others
+
+DOUBTED = REPEATED | {
+    codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED
+}  # fmt: skip
 """After these warnings, nothing that relies on the lights can be told."""
 
 EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
+    (same_images, frozenset()),
     (shifted_images, frozenset()),
-    (odd_image, frozenset()),
-    (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), frozenset()),
+    (odd_image, REPEATED),
+    (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), REPEATED),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
-    (same_images, frozenset()),
     (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
     (lambda seen: encoded_values(seen.evened, seen.directions) if seen.linear else [], DOUBTED),
     (lambda seen: [] if seen.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),

@@ -13,11 +13,13 @@ from splinecli.capture import CaptureSource
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.paths import reading
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
+from splinecli.system.files import equal_files
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,7 @@ class Evidence:
     linear: bool = True  # whether the values of the images are taken as linear
     truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
     strict: bool = False  # also warn of what the images do not tell
+    copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
     background: float = 0.0  # the share of dark background that was left out of the sample
 
     @classmethod
@@ -53,8 +56,11 @@ class Evidence:
     ) -> Evidence:
         """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
         (sample, closeup), lamps = samples, source.lamps
+        images = [source.files.images[index] for index in indices]
+        with reading(source.files.folder):
+            copies = equal_files(images)
         return cls(
-            [source.files.images[index].name for index in indices],
+            [image.name for image in images],
             source.light_directions,
             indices,
             sample,
@@ -69,6 +75,7 @@ class Evidence:
             linear=source.radiometry.curve == 1,
             truth=truth,
             strict=strict,
+            copies=copies,
         )
 
     @cached_property

@@ -149,7 +149,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
     if options.surface:
-        check_triangles(capture.mask)
+        check_triangles(capture.mask, folder)
 
 
 def _check_light_files(target: Path) -> None:

@@ -6,6 +6,7 @@ origin is the camera.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,19 +93,23 @@ def surface_mesh(
     )
 
 
-def check_triangles(mask: Bools) -> None:
-    """Raise InputError if the mesh of a mask (H, W) has no triangle: no square of four pixels has three of the mask."""
+def check_triangles(mask: Bools, path: Path) -> None:
+    """Raise InputError about `path` if the mesh of a mask (H, W) has no triangle.
+
+    No square of four pixels then has three of the mask.
+    """
     count = mask.astype(np.uint8)
     squares = count[:-1, :-1] + count[1:, :-1] + count[:-1, 1:] + count[1:, 1:]
     if not (squares >= 3).any():
-        raise no_triangles()
+        raise no_triangles(path, instead="leave --surface out")
 
 
-def no_triangles() -> InputError:
+def no_triangles(path: Path | None = None, *, instead: str = "leave glb out of the formats") -> InputError:
     """Return the error of a mesh that has none."""
     return InputError(
         "the mesh has no triangles: nowhere do three pixels of the object form a corner",
-        hint="Enlarge the mask, or leave glb out of the formats",
+        path=path,
+        hint=f"Enlarge the mask, or {instead}",
     )
 
 

@@ -1,12 +1,14 @@
 """Output files that appear complete or not at all, and checks of output folders."""
 
 import errno
+import filecmp
 import hashlib
 import itertools
 import json
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +16,7 @@ from typing import IO, Any
 from splinecli.errors import InputError, OutputError
 
 UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
+_PROBE = 1 << 12  # bytes of a file that are compared before the whole
 _MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
 
@@ -28,6 +31,18 @@ def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file's content in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
+    """Return the pairs of places in `paths` whose files have the same content. Raises OSError."""
+    alike = defaultdict(list)
+    for place, path in enumerate(paths):
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(size // 2)  # the first rows of many images are black
+            alike[size, file.read(_PROBE)].append(place)
+    pairs = itertools.chain.from_iterable(itertools.combinations(places, 2) for places in alike.values())
+    return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
 
 def create_hidden(folder: Path) -> IO[bytes]:

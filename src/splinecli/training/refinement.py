@@ -190,17 +190,20 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
 
 @torch.no_grad()
 def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor) -> Tensor:
-    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W), as they are in use."""
-    estimator = NetworkEstimator(
-        "spline-net", LoadedNetwork(network.eval(), "in training", ""), device=network.cells.device, precision="float32"
-    )
+    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W).
+
+    They are as in use with float32.
+    """
+    method = "spline-net" if network.config.interpolates else "cnn-ps"
+    loaded = LoadedNetwork(network.eval(), "in training", "")
+    estimator = NetworkEstimator(method, loaded, device=network.cells.device, precision="float32")
     directions = light_directions.numpy()
 
-    def light_on(rows: Rows, without: IndirectLight | None) -> LampLight:
+    def light_without(indirect: IndirectLight | None, rows: Rows) -> LampLight:
         own = observations.numpy()[rows]
-        return LampLight(own if without is None else without.remove(own, rows), directions)
+        return LampLight(own if indirect is None else indirect.remove(own, rows), directions)
 
-    estimated, errors, light_of = estimate_pixels(mask.numpy(), observations.numpy(), light_on, estimator)
+    estimated, errors, light_of = estimate_pixels(mask.numpy(), observations.numpy(), light_without, estimator)
     assert errors is not None, "TrainingConfig asks for an error head"
     lights = light_directions.to(estimator.device)
     signs, reference = alternating_signs(lights), brightness(observations)
