@@ -18,7 +18,7 @@ from splinecli.maths.normals import unit
 from splinecli.methods.estimator import UNKNOWN_ERROR
 from splinecli.methods.networks import NetworkEstimator
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.refine_net import REACH, RefineNet
+from splinecli.networks.refine_net import RefineNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement import refiner
@@ -26,6 +26,7 @@ from splinecli.refinement.refiner import NetworkRefiner
 from tiny_networks import TINY
 
 LIGHTS = spiral_lights(6, 60)
+REACH = RefineNet().reach
 Network = TypeVar("Network", bound=torch.nn.Module)
 
 

@@ -5,17 +5,17 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.networks.refine_channels import CHANNELS, split_features
-from splinecli.networks.refine_net import COARSEST, REACH, RefineNet
+from splinecli.networks.refine_channels import CHANNELS, channels, split_features, with_refined
+from splinecli.networks.refine_net import COARSEST, RefineNet
 from splinecli.refinement.features import Turn, refine_features, turn_features, turn_maps
 
 HEIGHT, WIDTH = 6, 9
 
 
-def random_net(seed: int = 0) -> RefineNet:
+def random_net(*, twice: bool = False) -> RefineNet:
     """A net whose every layer does something."""
-    generator = torch.Generator().manual_seed(seed)
-    net = RefineNet()
+    generator = torch.Generator().manual_seed(0)
+    net = RefineNet(twice=twice)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
@@ -70,38 +70,63 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     torch.testing.assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
 
 
-def test_a_new_net_changes_nothing() -> None:
+@pytest.mark.parametrize("twice", [False, True])
+def test_a_new_net_changes_nothing(twice: bool) -> None:
     features, mask = random_maps(12, 15)
     features[:, :3] = torch.nn.functional.normalize(features[:, :3], dim=1)
-    normals, error = RefineNet()(features, mask)
+    normals, error = RefineNet(twice=twice)(features, mask)
     before, error_before = split_features(features)
     torch.testing.assert_close(normals, before * mask)
     torch.testing.assert_close(error, error_before * mask)
 
 
-def test_outside_of_the_mask_is_outside_of_the_image() -> None:
+def test_a_second_net_reads_the_results_of_the_first() -> None:
+    features, mask = random_maps(12, 16)
+    both = random_net(twice=True)
+    assert both.again is not None
+    first = RefineNet()
+    first.load_state_dict({name: value for name, value in both.state_dict().items() if "again" not in name})
+    normals, error = first(features, mask)
+    changed = with_refined(features, normals, error)
+    torch.testing.assert_close(split_features(changed), (normals, error))
+    for fit in ("robust", "plain"):  # the fits themselves stay
+        torch.testing.assert_close(
+            changed[:, channels(fit)] + normals, features[:, channels(fit)] + features[:, channels("normal")]
+        )
+    rest = slice(channels("plain").stop, channels("error_median").start), slice(channels("largest").start, None)
+    for part in rest:
+        assert torch.equal(changed[:, part], features[:, part])
+    found = both(features, mask, (slice(0, 8), slice(8, 16)))
+    for part, whole in zip(found, both.again(changed * mask, mask), strict=True):
+        torch.testing.assert_close(part, whole[..., :8, 8:], atol=1e-4, rtol=1e-4)
+    assert (found[0] - normals[..., :8, 8:]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
     features, mask = random_maps(20, 24)
     wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
     wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
-    net = random_net().double()
+    net = random_net(twice=twice).double()
     box = (..., slice(2 * COARSEST, 2 * COARSEST + 20), slice(COARSEST, COARSEST + 24))
     found = net(features.double(), mask.double()), net(wide.double(), wide_mask.double())
     for alone, within in zip(*found, strict=True):
         torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("twice", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_nothing_beyond_the_reach_counts(turned: bool) -> None:
+def test_nothing_beyond_the_reach_counts(turned: bool, twice: bool) -> None:
     """Along a strip that is as wide as two of the coarsest cells."""
-    size = 2 * REACH + COARSEST
+    net = random_net(twice=twice).double()
+    size = 2 * net.reach + COARSEST
     features, mask = random_maps(*((2 * COARSEST, size) if turned else (size, 2 * COARSEST)))
-    net = random_net().double()
     before = net(features.double(), mask.double())
     for place in (0, size - 1):
         changed = features.clone().double()
         changed.select(-1 if turned else -2, place).add_(1)
         after = net(changed, mask.double())
-        far = torch.arange(size).sub(place).abs() >= REACH
+        far = torch.arange(size).sub(place).abs() >= net.reach
         for one, other in zip(before, after, strict=True):
             difference = (one - other).abs().amax(dim=(0, 1, 2 if turned else 3))
             assert difference[far].max() == 0

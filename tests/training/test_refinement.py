@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.errors import UsageError
+from splinecli.errors import ModelError, UsageError
 from splinecli.networks.refine_channels import CHANNELS
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights
@@ -122,6 +122,22 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining: T
     after = load_weights(tmp_path / "run" / WEIGHTS).network.state_dict()
     changed = {name for name in before if not torch.equal(after[name].half(), before[name].half())}
     assert changed and all(name.startswith("refine_net.") for name in changed)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_second_refinement_net_follows_one_that_is_trained(refining: TrainingConfig, tmp_path: Path) -> None:
+    Trainer(refining, tmp_path / "first", CPU).run()
+    start_from = str(tmp_path / "first" / WEIGHTS)
+    twice = replace(refining, network=replace(refining.network, refines_twice=True), start_from=start_from, steps=3)
+    second = Trainer(twice, tmp_path / "second", CPU)
+    first = load_weights(tmp_path / "first" / WEIGHTS).network.refine_net
+    assert torch.equal(second.network.refine_net.out.weight, first.out.weight)
+    second.run()
+    found = load_weights(tmp_path / "second" / WEIGHTS).network.refine_net
+    assert found.again.out.weight.any()
+    assert all(torch.equal(value, found.state_dict()[name]) for name, value in first.state_dict().items())
+    with pytest.raises(ModelError, match="with refines_twice = True, the run's has False"):
+        Trainer(replace(refining, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
 
 
 def network_of(config: TrainingConfig) -> SplineNet:

@@ -47,3 +47,18 @@ def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
     offset = features.new_tensor((-MEDIAN_OFFSET, 1.0))[:, None, None]
     error = features[:, channels("error_median").start : channels("error_shape").stop]
     return features[:, channels("normal")], error + offset
+
+
+def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
+    """Return maps of features (B, CHANNELS, H, W) with other normals (B, 3, H, W) and errors (B, 2, H, W).
+
+    What describes how the estimated normal explains the observations stays as it is.
+    """
+    offset = features.new_tensor((-MEDIAN_OFFSET, 1.0))[:, None, None]
+    turned = features[:, channels("normal")] - normals
+    changed = features.clone()
+    changed[:, channels("normal")] = normals
+    for other in ("robust", "plain"):
+        changed[:, channels(other)] += turned
+    changed[:, channels("error_median").start : channels("error_shape").stop] = error - offset
+    return changed

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
 from splinecli.networks.layers import ResidualBlock, zeroed
-from splinecli.networks.refine_channels import READ, split_features
+from splinecli.networks.refine_channels import READ, split_features, with_refined
 
 WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
 ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks of each scale on the way down
@@ -20,7 +20,7 @@ SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of the smoothed normals that the ne
 # Logarithms of errors in radians, for the weights of the smoothing.
 _LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
 COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of the coarsest scale's pixels. The origins of tiles are multiples of it.
-REACH = 96  # no pixel further away than this changes a result
+_REACH = 96  # of one net
 _DECODED = 4  # pixels of each scale that the decoder needs around a part of the map, at least
 Part = tuple[slice, slice]  # rows and columns of a map
 
@@ -31,10 +31,17 @@ class RefineNet(nn.Module):
     The result is the estimated normal, plus weighted differences from it to smoothed normals, plus a correction.
 
     After each layer, everything outside the mask is zero. A pixel outside the mask is therefore the same as one outside
-    of the image, so tiles with an overlap of REACH give the same as the whole image.
+    of the image, so tiles with an overlap of `reach` give the same as the whole image.
+
+    Args:
+        twice: whether a second such net, `again`, corrects the result. It reads what the first one reads, with the
+            first one's normals and errors.
+
+    Attributes:
+        reach: no pixel further away than this changes a result.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, twice: bool = False) -> None:
         super().__init__()
         self.enter = nn.Conv2d(READ + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
@@ -48,6 +55,8 @@ class RefineNet(nn.Module):
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
+        self.again = RefineNet() if twice else None
+        self.reach = _REACH * (1 + twice)
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H, W) of 1 and 0.
@@ -56,6 +65,13 @@ class RefineNet(nn.Module):
         map that is wanted, whose bounds are multiples of COARSEST or the end; None for all. The decoder leaves the rest
         out.
         """
+        if self.again is not None:
+            features = with_refined(features, *self._correct(features, mask, None)) * mask
+            found: tuple[Tensor, Tensor] = self.again(features, mask, inner)
+            return found
+        return self._correct(features, mask, inner)
+
+    def _correct(self, features: Tensor, mask: Tensor, inner: Part | None) -> tuple[Tensor, Tensor]:
         height, width = mask.shape[-2:]
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])

@@ -32,7 +32,7 @@ from splinecli.system.side_by_side import side_by_side
 MARGIN = 64
 """Pixels around a tile that are seen, a multiple of COARSEST.
 
-The net can see further (REACH), but what lies beyond the margin turns no normal by more than 0.01 degrees.
+The net can see further (its `reach`), but what lies beyond the margin turns no normal by more than 0.01 degrees.
 """
 
 TILE = 608
@@ -69,7 +69,7 @@ class NetworkRefiner:
         network: the refinement net, on its device.
         precision: the number format of the convolutions.
         turns: the results of this many quarter turns of the map are averaged. Mirror images gain nothing beside them.
-        tile, margin: see TILE and MARGIN. With a margin of REACH, tiles change nothing.
+        tile, margin: see TILE and MARGIN. With a margin of the net's `reach`, tiles change nothing.
         most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real; the net
             sees their maps as they are, on more pixels once rather than in all turns.
     """
