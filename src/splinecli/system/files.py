@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 import secrets
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,13 +34,18 @@ def file_sha256(path: Path) -> str:
 
 
 def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
-    """Return the pairs of places in `paths` whose files have the same content. Raises OSError."""
+    """Return the pairs of places in `paths` whose files have the same content. Raises OSError.
+
+    Only files of equal size are opened.
+    """
+    sizes = [path.stat().st_size for path in paths]
+    usual = Counter(sizes)
     alike = defaultdict(list)
-    for place, path in enumerate(paths):
-        with path.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(size // 2)  # the first rows of many images are black
-            alike[size, file.read(_PROBE)].append(place)
+    for place, (path, size) in enumerate(zip(paths, sizes, strict=True)):
+        if usual[size] > 1:  # others are not opened
+            with path.open("rb") as file:
+                file.seek(size // 2)  # the first rows of many images are black
+                alike[size, file.read(_PROBE)].append(place)
     pairs = itertools.chain.from_iterable(itertools.combinations(places, 2) for places in alike.values())
     return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
