@@ -32,7 +32,8 @@ from splinecli.system.side_by_side import side_by_side
 MARGIN = 64
 """Pixels around a tile that are seen, a multiple of COARSEST.
 
-The net can see further (its `reach`), but what lies beyond the margin turns no normal by more than 0.01 degrees.
+The net can see further (its `reach`). What lies beyond the margin turns no normal by more than 0.01 degrees after one
+net; after two (RefineNet's `twice`), seams of 0.4 degrees were measured, and none above 0.004 with a margin of 112.
 """
 
 TILE = 608
