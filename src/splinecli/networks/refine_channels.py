@@ -39,14 +39,17 @@ VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VE
 
 _FIRST = channels("light_moments").start
 TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)  # channels that hold the xx, yy and xy of a tensor
+_ERROR = slice(channels("error_median").start, channels("error_shape").stop)
 MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
 
 
 def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return normals (B, 3, H, W) and error (B, 2, H, W) from maps of features (B, CHANNELS, H, W)."""
-    offset = features.new_tensor((-MEDIAN_OFFSET, 1.0))[:, None, None]
-    error = features[:, channels("error_median").start : channels("error_shape").stop]
-    return features[:, channels("normal")], error + offset
+    return features[:, channels("normal")], features[:, _ERROR] + _error_offset(features)
+
+
+def _error_offset(features: Tensor) -> Tensor:
+    return features.new_tensor((-MEDIAN_OFFSET, 1.0))[:, None, None]
 
 
 def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
@@ -54,11 +57,10 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
 
     What describes how the estimated normal explains the observations stays as it is.
     """
-    offset = features.new_tensor((-MEDIAN_OFFSET, 1.0))[:, None, None]
     turned = features[:, channels("normal")] - normals
     changed = features.clone()
     changed[:, channels("normal")] = normals
     for other in ("robust", "plain"):
         changed[:, channels(other)] += turned
-    changed[:, channels("error_median").start : channels("error_shape").stop] = error - offset
+    changed[:, _ERROR] = error - _error_offset(features)
     return changed
