@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about sixteen hours on two cores:
+# Train the weights that come with splinecli from scratch, in about eighteen hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
@@ -25,10 +25,13 @@ run() {
 run spline-net-1 whole-scenes --preset compact --generator-weight 0.7 --steps 67000
 run spline-net-2 whole-scenes --preset compact --generator-weight 0.7 --steps 4000 --param learning_rate=1e-3 \
   --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
-run spline-net-3 whole-scenes --preset refine --steps 47000 --start-from "$folder/spline-net-2/weights.safetensors"
+run spline-net-3 whole-scenes --preset refine --steps 47000 \
+  --param network.refines_twice=false --start-from "$folder/spline-net-2/weights.safetensors"
+run spline-net-4 whole-scenes --preset refine --steps 10000 --param learning_rate=4e-4 \
+  --start-from "$folder/spline-net-3/weights.safetensors"
 run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136
 run cnn-ps-2 scenes --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-echo "$folder/spline-net-3/weights.safetensors"
+echo "$folder/spline-net-4/weights.safetensors"
 echo "$folder/cnn-ps-2/weights.safetensors"

@@ -13,10 +13,11 @@ from splinecli.light.lamp_light import LampLight
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
-from splinecli.refinement.refiner import MARGIN, NetworkRefiner
+from splinecli.refinement.refiner import MARGIN, TILE, NetworkRefiner
 
 SIZE = 48
 HALVED = False
+SEAMS = 3 * MARGIN  # the side of a map whose tiles at the corners see a part of it
 AZIMUTH = np.arange(10) * np.radians(36)
 ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
 LIGHTS = directions_at(AZIMUTH, ZENITH)
@@ -133,20 +134,21 @@ def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
 
 def test_seams_of_tiles_do_not_show() -> None:
     """The margin of a tile is smaller than what the net can see. Its share of a normal is far below its error."""
-    rows, columns = np.mgrid[:144, :144]
+    rows, columns = np.mgrid[:SEAMS, :SEAMS]
     slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
     normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))
     capture = scene(normals, np.where(columns % 40 < 20, 0.8, 0.2), noise=0.01, gloss=0.5)
     noise = np.random.default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
     before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
     errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
-    whole = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32")))
+    network = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32"))).network
     found = []
 
     def light_of(chosen: Any) -> LampLight:
         return LampLight(capture.observations[chosen], LIGHTS)
 
-    for refiner in (whole, NetworkRefiner(whole.network, "float32", tile=MARGIN)):
+    for tile in (TILE, MARGIN):
+        refiner = NetworkRefiner(network, "float32", turns=1, tile=tile)
         normals, errors = before.copy(), errors_before.copy()
         refiner.refine(capture.mask, capture.observations, light_of, normals, errors)
         found.append((normals, errors))

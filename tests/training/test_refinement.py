@@ -10,13 +10,13 @@ import torch
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.refine_channels import CHANNELS
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import load_weights
+from splinecli.networks.weights import load_weights, resolve_weights, save_weights
 from splinecli.pixel_sets.store import Pixels, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.whole_capture import photograph_scene
 from splinecli.training import refinement, tasks
-from splinecli.training.config import TrainingConfig
+from splinecli.training.config import PRESETS, TrainingConfig
 from splinecli.training.defaults import WEIGHTS
 from splinecli.training.loop import Trainer
 from splinecli.training.refinement import STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
@@ -138,6 +138,20 @@ def test_a_second_refinement_net_follows_one_that_is_trained(refining: TrainingC
     assert all(torch.equal(value, found.state_dict()[name]) for name, value in first.state_dict().items())
     with pytest.raises(ModelError, match="with refines_twice = True, the run's has False"):
         Trainer(replace(refining, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
+
+
+def test_a_second_refinement_net_needs_a_first(refining: TrainingConfig, tmp_path: Path) -> None:
+    without = SplineNet(replace(refining.network, refines=False))
+    save_weights(without, tmp_path / "without.safetensors")
+    network = replace(refining.network, refines_twice=True)
+    twice = replace(refining, network=network, start_from=str(tmp_path / "without.safetensors"))
+    with pytest.raises(ModelError, match="no refinement net"):
+        Trainer(twice, tmp_path / "run", CPU)
+
+
+def test_the_preset_continues_the_weights_that_it_starts_from() -> None:
+    refine = PRESETS["refine"]
+    assert refine.network == resolve_weights(refine.start_from).network.config
 
 
 def network_of(config: TrainingConfig) -> SplineNet:

@@ -100,8 +100,17 @@ def train(
         settings = replace(settings, steps=steps, minutes=0.0)
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
-    warn = Messages(quiet=quiet).warn
-    with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard, warn=warn) as trainer:
+    messages = Messages(quiet=quiet)
+    start = open_run(
+        settings,
+        output,
+        device.value,
+        resume=resume,
+        tensorboard=tensorboard,
+        warn=messages.warn,
+        say=messages.say,
+    )
+    with start as trainer:
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
             print(printable(output / defaults.WEIGHTS))

@@ -65,7 +65,7 @@ class Estimate(NamedTuple):
 
 
 class SplineNet(nn.Module):
-    """LI-Net, NE-Net and all steps between raw observations and normals; the refinement net follows on the map."""
+    """LI-Net, NE-Net and all steps between raw observations and normals; the refinement nets follow on the map."""
 
     cells: Tensor
     inside: Tensor

@@ -33,7 +33,7 @@ class TrainingConfig:
     shards: int = 4
     # "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates` steps for
     # NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and trains the error head
-    # alone. "refine_net" fixes all these and trains the (last) refinement net on pixel sets of rendered scenes.
+    # alone. "refine_net" fixes all these and trains the last refinement net on pixel sets of rendered scenes.
     updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
     ne_net_updates: int = 5
     learning_rate: float = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
@@ -189,7 +189,7 @@ PRESETS = {
         network=_COMPACT, pixels=PixelGeneratorConfig(capture_pixels=64), batch_size=512, shards=2
     ),
     "refine": TrainingConfig(
-        network=replace(_COMPACT, error_head=True, refines=True),
+        network=replace(_COMPACT, error_head=True, refines=True, refines_twice=True),
         start_from="spline-net",
         updates="refine_net",
         batch_size=4,

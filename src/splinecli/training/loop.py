@@ -54,6 +54,11 @@ def _start_from(weights: str, network: SplineNet) -> None:
                 f"the weights {weights!r} are of a network {problem}",
                 hint="Choose the preset, or the settings network.*, that the weights were trained with",
             )
+    if wanted["refines_twice"] and not found["refines"]:
+        raise ModelError(
+            f"the weights {weights!r} have no refinement net, and the run would train the second one",
+            hint="Train the first one with --param network.refines_twice=false",
+        )
     network.load_state_dict(loaded.state_dict(), strict=False)
 
 
@@ -251,10 +256,11 @@ def open_run(
     resume: bool,
     tensorboard: bool,
     warn: Callable[[str], object],
+    say: Callable[[str], object],
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
 
-    `warn` receives a sentence about what a killed process had left in the folder.
+    `warn` receives a sentence about what a killed process had left in the folder, `say` one about a long start.
 
     Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
     installed; ModelError if the checkpoint does not fit, or weights to start from cannot be used; InputError if a pixel
@@ -268,4 +274,6 @@ def open_run(
         workers.shards(config.shards)  # raises UsageError before the folder is made
         if workers.leads:
             stack.enter_context(held_folder(folder, warn))
+            if config.updates == "refine_net":
+                say("photographing the first captures, for some minutes")
         yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard)
