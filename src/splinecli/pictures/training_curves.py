@@ -43,6 +43,7 @@ def training_figure(columns: Columns) -> Figure:
 def _plot(axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1) -> None:
     points = [(step, value) for step, value in zip(columns["step"], columns[name], strict=True) if value is not None]
     if points:
+        style = "o" if len(points) == 1 else style  # one point is no line
         axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
 
 
