@@ -42,7 +42,7 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
     usual = Counter(sizes)
     alike = defaultdict(list)
     for place, (path, size) in enumerate(zip(paths, sizes, strict=True)):
-        if usual[size] > 1:  # others are not opened
+        if usual[size] > 1:
             with path.open("rb") as file:
                 file.seek(size // 2)  # the first rows of many images are black
                 alike[size, file.read(_PROBE)].append(place)
