@@ -72,9 +72,9 @@ def train(
     device: shared.Device = shared.DEVICE,
     quiet: bool = shared.QUIET,
 ) -> None:
-    """Train LI-Net and NE-Net, or with --preset refine the refinement net.
+    """Train LI-Net and NE-Net, or with --preset refine a refinement net.
 
-    Without a SET, the pixels are generated during training; the refinement net needs a SET. Writes
+    Without a SET, the pixels are generated during training; a refinement net needs a SET. Writes
     weights.safetensors, which --weights of other commands takes, checkpoint.safetensors, config.json, metrics.csv,
     curves.png and maps.png into RUN. After Ctrl-C, --resume continues from the checkpoint. Settings come from the
     preset, then from --config, then from the other options. With torchrun, several processes train together.

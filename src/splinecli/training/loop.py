@@ -77,8 +77,9 @@ class Trainer:
         resume: bool = False,
         workers: Workers | None = None,
         tensorboard: bool = False,
+        say: Callable[[str], object] = lambda sentence: None,
     ) -> None:
-        """Start a run, or resume one. Raises ModelError, OutputError, InputError, UsageError."""
+        """Start a run, or resume one; see open_run. Raises ModelError, OutputError, InputError, UsageError."""
         self.config = config
         self.folder = folder
         self.device = device
@@ -108,6 +109,8 @@ class Trainer:
         if resume:
             state = self.network, self.average, self.optimizer
             self.counters = load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
+        if self.workers.leads and config.updates == "refine_net":
+            say("photographing the first captures, for some minutes")
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
@@ -274,6 +277,4 @@ def open_run(
         workers.shards(config.shards)  # raises UsageError before the folder is made
         if workers.leads:
             stack.enter_context(held_folder(folder, warn))
-            if config.updates == "refine_net":
-                say("photographing the first captures, for some minutes")
-        yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard)
+        yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard, say=say)
