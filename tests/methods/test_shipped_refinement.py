@@ -133,7 +133,7 @@ def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
 
 
 def test_seams_of_tiles_do_not_show() -> None:
-    """The margin of a tile is smaller than what the net can see. Its share of a normal is far below its error."""
+    """The margin of a tile is smaller than what the nets can see. Its share of a normal is far below its error."""
     rows, columns = np.mgrid[:SEAMS, :SEAMS]
     slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
     normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))

@@ -109,8 +109,8 @@ class Trainer:
         if resume:
             state = self.network, self.average, self.optimizer
             self.counters = load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
-        if self.workers.leads and config.updates == "refine_net":
-            say("photographing the first captures, for some minutes")
+        if self.workers.leads and self.task.long_start:
+            say(self.task.long_start)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)

@@ -41,6 +41,8 @@ class SampleMaps(NamedTuple):
 class PixelTask:
     """Batches of pixels from the sources of a run: its `source` for training, and those for `validation`."""
 
+    long_start = ""  # what `prepare` does if it takes minutes, in words for people
+
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
         self.shards = shards
@@ -143,6 +145,8 @@ def _estimate(
 
 class RefinementTask:
     """Captures of whole scenes, photographed while training goes on; see ScenePool."""
+
+    long_start = "photographing the first captures, for some minutes"
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
