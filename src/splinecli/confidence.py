@@ -80,14 +80,13 @@ def correct_errors(
     return True
 
 
-def add_light_error(errors: Floats32, light_errors_deg: NDArray[np.float64]) -> None:
-    """Widen distributions of errors (P, 2) in place by the expected errors (F,) of lights that were estimated.
+def add_common_error(errors: Floats32, error_deg: float) -> None:
+    """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
-    Such lights are wrong together: the normals turn with them, by about as much. The medians of both errors add up as
-    those of independent errors do.
+    Wrong lights or values turn the normals together. The medians of both errors are added as those of independent
+    errors are.
     """
-    turn = np.radians(light_errors_deg.mean())
-    errors[:, 0] = np.logaddexp(2 * errors[:, 0], 2 * np.log(turn)) / 2
+    errors[:, 0] = np.logaddexp(2 * errors[:, 0], 2 * np.log(np.radians(error_deg))) / 2
 
 
 class CaptureFeatures(NamedTuple):

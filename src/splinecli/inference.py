@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.confidence import add_light_error, correct_errors
+from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
@@ -129,8 +129,11 @@ def _estimate(
         with (stage or _no_stage)("refining") as advance:
             refiner.refine(capture.mask, capture.observations, found.light_of, normals, errors, progress=advance)
     judged = errors is not None and correct_errors(capture, estimator, found.light_of, normals, errors)
-    if errors is not None and capture.light_errors_deg is not None:
-        add_light_error(errors, capture.light_errors_deg)
+    if errors is not None:
+        found_lights = [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
+        for error_deg in (*found_lights, *(warning.error_deg for warning in capture.warnings)):
+            if error_deg:
+                add_common_error(errors, error_deg)
     return normals, errors, judged
 
 

@@ -9,7 +9,7 @@ from scenes import cap_directions, shade, sphere, sphere_cap
 from splinecli import estimate_normals
 from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.capture.restore.light_refinement import fit_near
-from splinecli.confidence import add_light_error
+from splinecli.confidence import add_common_error
 from splinecli.errors import InputError, UsageError
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.light.unknown_lights import find_lights
@@ -152,7 +152,7 @@ def test_the_border_of_the_image_is_no_outline() -> None:
 
 def test_confidence_includes_the_lights() -> None:
     errors = np.array([[np.log(0.03), 1.0], [np.log(0.5), 1.0]], np.float32)
-    add_light_error(errors, np.array([2.0, 4.0]))
+    add_common_error(errors, 3.0)
     turn = np.radians(3.0)
     np.testing.assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
 

@@ -11,10 +11,13 @@ class CaptureWarning:
     """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
     code: a name that stays the same when the sentence changes; one of the constants below.
+    error_deg: the median angle in degrees by which normals are wrong if the warning is right. The confidence falls by
+        it. None if the normals are not concerned, or the confidence accounts for the fault in another way.
     """
 
     code: str
     text: str
+    error_deg: float | None = None
 
     def __str__(self) -> str:
         return self.text

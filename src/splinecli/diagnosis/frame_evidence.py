@@ -13,13 +13,14 @@ import numpy as np
 
 from splinecli.capture.robust_fit import fit_robustly, shadow_weights
 from splinecli.maths.arrays import Bools, Doubles, Floats
-from splinecli.maths.normals import unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
 STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
 _FITS = 5
+_TURNED_PIXELS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,28 @@ def rough_normals(observations: Floats, light_directions: Doubles, mask: Bools) 
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)
+
+
+def median_turn_deg(
+    observations: Floats, lights: Doubles, other_lights: Doubles, other_observations: Floats | None = None
+) -> float:
+    """Return the median angle in degrees between the normals that two readings of a capture give.
+
+    It is the error of the first reading if the second is right. Each is a robust fit of observations (P, F) under
+    lights (F, 3) or (P, F, 3); None for the observations of the first reading.
+    """
+    readings = (
+        (observations, lights),
+        (observations if other_observations is None else other_observations, other_lights),
+    )
+    step = max(1, len(observations) // _TURNED_PIXELS)
+    normals = []
+    for values, directions in readings:
+        values = values[::step].astype(np.float64)
+        values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+        own = directions if directions.ndim == 2 else directions[::step]
+        normals.append(unit(fit_robustly(values, shadow_weights(values), own, _FITS)[0]))
+    return float(np.median(angle_between_deg(*normals)))
 
 
 def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:

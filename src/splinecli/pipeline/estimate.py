@@ -122,6 +122,7 @@ def estimate_capture(
         capture = refine_lights(capture)
         warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
+    capture = replace(capture, warnings=tuple(warnings))
     clock.begin("estimate")
     capture = find_surface(capture)
     clock.begin("distil")
