@@ -97,6 +97,8 @@ def estimate_normals(
     from functools import partial
     from warnings import warn
 
+    import numpy as np
+
     from splinecli.capture.arrays import capture_from_arrays
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
@@ -124,7 +126,8 @@ def estimate_normals(
     )
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
-    check = partial(check_arrays, intensities_measured=light_intensities is not None)
+    given = None if light_intensities is None else np.asarray(light_intensities, np.float64)
+    check = partial(check_arrays, intensities=given)
     estimate, _ = estimate_capture(capture, estimator, check, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
         if warning.code in PROBABLY_WRONG:

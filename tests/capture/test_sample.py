@@ -39,5 +39,5 @@ def test_wrong_lights_are_named_without_a_mask(masked):
     images, lights, mask = ball_before(0.01)
     for signs, expected in (((-1, 1, 1), ["light_frame"]), ((1, 1, 1), [])):
         capture = capture_from_arrays(images, lights * signs, mask if masked else np.ones_like(mask))
-        codes = [warning.code for warning in check_arrays(capture, intensities_measured=True)]
+        codes = [warning.code for warning in check_arrays(capture, intensities=np.ones(capture.n_lights))]
         assert codes == expected + ([] if masked else ["no_mask"])

@@ -60,7 +60,7 @@ def codes(intensities: np.ndarray) -> list[str]:
     shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ halfway(lights).T).clip(0) ** 12) * intensities
     values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
     capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
-    return [warning.code for warning in check_arrays(capture, intensities_measured=False)]
+    return [warning.code for warning in check_arrays(capture)]
 
 
 def test_unequal_intensities_that_cannot_be_estimated_are_named() -> None:

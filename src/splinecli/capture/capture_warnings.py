@@ -25,6 +25,7 @@ class CaptureWarning:
 
 AMBIENT_SUBTRACTED = "ambient_subtracted"
 BLACK_PIXELS = "black_pixels"
+CONSTANT_LIGHT = "constant_light"
 DARK_IMAGES = "dark_images"
 DIFFERENT_SIZES = "different_sizes"
 DISPLAY_DECODED = "display_decoded"
@@ -64,8 +65,8 @@ UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
 PROBABLY_WRONG = frozenset({
-    ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR,
-    LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, REPEATED_IMAGES,
+    CONSTANT_LIGHT, ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE,
+    LAMPS_NEAR, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, REPEATED_IMAGES, UNEQUAL_INTENSITIES,
 })  # fmt: skip
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 

@@ -8,12 +8,12 @@ import numpy as np
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
-from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
-from splinecli.diagnosis.evidence import Evidence
-from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
+from splinecli.diagnosis.evidence import Evidence, gray_intensities
+from splinecli.diagnosis.explanations import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
+from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
@@ -27,9 +27,7 @@ SAME_IMAGE = 1e-12
 
 SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
-UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
-"""Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
-that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
+_SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
 
 _MOST_NAMED = 4  # shifted images in a sentence
 
@@ -110,27 +108,65 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
 
-def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
-    """Warn of intensities that are unequal, but that the images do not determine."""
-    if seen.has_positions and seen.lamps is None:
-        return []  # near lamps that count as distant look unequal
-    if seen.intensities_known or seen.factors is None:
+def other_readings(seen: Evidence) -> list[CaptureWarning]:
+    """Warn of images that fit much better if they are read in another way; see readings.py."""
+    kinds: set[Kind] = {"offset", "intensities"}
+    if seen.linear:
+        kinds.add("curve")
+    if not seen.has_positions:
+        kinds.add("near")
+    readings = seen.readings
+    likeliest = readings.likeliest(kinds, eight_bit=seen.eight_bit)
+    if likeliest is None or likeliest[1] < LIKELY:
         return []
-    equal, free = (
-        float(replace(seen.factors, intensities_known=known).misfits(seen.directions[None])[0])
-        for known in (True, False)
+    reading, _ = likeliest
+    if reading.kind == "intensities" and seen.estimated is not None:
+        return []  # they are divided out
+    error_deg = readings.error_deg(reading, seen.estimated)
+    left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
+    if reading.kind == "curve":
+        text = (
+            f"The images look display-encoded but are read as linear: if their values are decoded, {left}. Add"
+            f" --transfer srgb{'' if reading.amount == SRGB_EXPONENT else f' or gamma:{reading.amount:g}'}."
+        )
+        return [CaptureWarning(codes.ENCODED_VALUES, text, error_deg)]
+    if reading.kind == "near":
+        text = (
+            f"The lamps look near, about {reading.amount:.1f} widths of the object away, but are treated as distant: at"
+            f" this distance, {left}. Measure the distance and the width of the object, or try --light-distance"
+            f" {reading.amount:.1f} --object-width 1."
+        )
+        return [CaptureWarning(codes.LAMPS_NEAR, text, error_deg)]
+    if reading.kind == "offset":
+        text = (
+            "All images look as if they contained ambient light, or a black level that was not subtracted:"
+            f" {100 * reading.amount:.0f} % of the light of a lamp. Without it, {left}. Photograph the object with all"
+            " lamps off and give this image with --ambient."
+        )
+        return [CaptureWarning(codes.CONSTANT_LIGHT, text, error_deg)]
+    return [CaptureWarning(codes.UNEQUAL_INTENSITIES, _intensities_text(seen, reading, left), error_deg)]
+
+
+def _intensities_text(seen: Evidence, reading: Reading, left: str) -> str:
+    given = seen.intensities
+    if given is None:
+        return (
+            f"The lights look unequally bright: with other intensities, {left}. But the images do not determine them,"
+            " so equal ones are assumed. Measure them with calibrate --gray-card, or give them with --intensities FILE."
+        )
+    needed = np.log(given * reading.intensities)
+    ways = {
+        "if they are left out": np.zeros_like(given),
+        "if they are inverted": -np.log(given),
+        "in reversed order": np.log(given[::-1]),
+    }
+    errors = {words: float(np.std(needed - way)) for words, way in ways.items()}
+    words = min(errors, key=lambda each: errors[each])
+    how = f", for example {words}" if errors[words] < _SAME_INTENSITIES * np.std(np.log(reading.intensities)) else ""
+    return (
+        f"The light intensities that are given do not fit the images: with other ones{how}, {left}. Check that their"
+        " file is in the order of the images, or leave them out with --intensities equal."
     )
-    if not UNEQUAL_MISFIT[0] < equal < UNEQUAL_MISFIT[1] or free > UNEQUAL_RATIO * equal:
-        return []
-    observations = np.asarray(seen.observations, np.float32)
-    if estimate_light_intensities(observations, None, seen.directions) is not None:
-        return []
-    text = (
-        f"The lights look unequally bright: other intensities leave {100 * free / equal:.0f} % of the misfit, but the"
-        " images do not determine them, so they count as equal. Measure them with calibrate --gray-card, or give them"
-        " with --intensities FILE."
-    )
-    return [CaptureWarning(codes.UNEQUAL_INTENSITIES, text)]
 
 
 REPEATED = frozenset({codes.REPEATED_IMAGES})  # where the lights differ, these contradict any others
@@ -140,7 +176,7 @@ DOUBTED = REPEATED | {
 }  # fmt: skip
 """After these warnings, nothing that relies on the lights can be told."""
 
-EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
+EXPLAINED = DOUBTED | {codes.ENCODED_VALUES, codes.LAMPS_NEAR, codes.CONSTANT_LIGHT}
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (same_images, frozenset()),
@@ -150,10 +186,8 @@ CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
-    (lambda seen: encoded_values(seen.evened, seen.directions) if seen.linear else [], DOUBTED),
-    (lambda seen: [] if seen.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),
-    (rough_lights, EXPLAINED | {codes.LAMPS_NEAR}),
-    (unequal_intensities, EXPLAINED | {codes.LAMPS_NEAR}),
+    (other_readings, DOUBTED),
+    (rough_lights, EXPLAINED),
 )
 """The checks, and the codes of earlier warnings after which each is skipped."""
 
@@ -164,11 +198,16 @@ WITHOUT_LIGHTS = (shifted_images, missing_mask, same_images)
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
     """Return warnings about a capture that was read from this source; see check_evidence."""
     samples, truth = _samples(capture), capture.ground_truth
-    return check_evidence(Evidence.of_source(source, samples, capture.light_indices, truth=truth, strict=strict))[1]
+    seen = Evidence.of_source(source, samples, capture.light_indices, truth=truth, strict=strict)
+    return check_evidence(replace(seen, estimated=capture.estimated_intensities))[1]
 
 
-def check_arrays(capture: Capture, *, intensities_measured: bool) -> list[CaptureWarning]:
-    """Return warnings about a capture that was made from arrays; see check_evidence."""
+def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list[CaptureWarning]:
+    """Return warnings about a capture that was made from arrays; see check_evidence.
+
+    Args:
+        intensities: (F,) or (F, 3), those that were given; None for none.
+    """
     (sample, closeup), lamps, n_lights = _samples(capture), capture.lamps, capture.n_lights
     seen = Evidence(
         [f"images[{index}]" for index in range(n_lights)],
@@ -176,8 +215,10 @@ def check_arrays(capture: Capture, *, intensities_measured: bool) -> list[Captur
         range(n_lights),
         sample,
         closeup,
-        intensities_measured,
-        intensities_measured,
+        intensities is not None,
+        intensities is not None,
+        intensities=None if intensities is None else gray_intensities(intensities),
+        estimated=capture.estimated_intensities,
         lamps=None if lamps is None else lamps.within(0, 0, sample.step, lamps.camera_matrix),
         has_positions=lamps is not None,
         found=capture.light_errors_deg is not None,

@@ -17,6 +17,7 @@ from splinecli.capture.paths import reading
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.diagnosis.readings import Readings
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
 from splinecli.system.files import equal_files
@@ -33,6 +34,9 @@ class Evidence:
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
     intensities_known: bool  # whether they are given, or the user says that they are equal
+    intensities: Doubles | None = None  # (F,), those that are given, by which the observations were divided
+    estimated: Doubles | None = None  # (F,), those that were estimated, by which the sample was not divided
+    eight_bit: bool = False  # whether the images have 8 bits
     lamps: NearLamps | None = None  # all near lamps, over the grid of the sample; None if the lights count as distant
     has_positions: bool = False  # whether positions of lamps are known
     found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
@@ -67,6 +71,10 @@ class Evidence:
             closeup,
             source.intensities_measured,
             source.intensities_known,
+            intensities=gray_intensities(source.light_intensities[list(indices)])
+            if source.intensities_measured
+            else None,
+            eight_bit=any((source.facts[index].stated_size or ((), 0))[1] == 1 for index in indices),
             lamps=lamps.over(source, sample.mask, step=sample.step) if lamps is not None and lamps.used else None,
             has_positions=lamps is not None,
             found=source.find_lights is not None,
@@ -112,6 +120,12 @@ class Evidence:
         return replace(self.sample, observations=self.observations / intensities)
 
     @cached_property
+    def readings(self) -> Readings:
+        """The sample as the files store it, to be read in other ways."""
+        observations = self.observations if self.intensities is None else self.observations * self.intensities
+        return Readings(replace(self.sample, observations=observations), self.directions, self.intensities)
+
+    @cached_property
     def light_check(self) -> LightCheck:
         return check_lights(
             self.observations, self.sample.mask, self.all_directions, self.indices, self.names, self.factors
@@ -120,3 +134,11 @@ class Evidence:
     @cached_property
     def shifts(self) -> list[ImageShift]:
         return find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+
+
+def gray_intensities(intensities: Floats) -> Doubles:
+    """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are divided out."""
+    values = np.asarray(intensities, np.float64)
+    if values.ndim == 2:
+        values = 1 / (1 / values).mean(axis=1)
+    return np.asarray(values / values.mean())

@@ -25,6 +25,7 @@ FLAT_SPREAD = 0.35
 painting. There, a tilt of all normals together looks like other intensities, so the tilt is the likeliest one."""
 
 TILT = 0.09  # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
+_TRUSTED_TILTS = 1.5  # times TILT: where equal intensities turn a flat object by less than that, they stay
 MAX_ERROR_RATIO = 0.35  # largest accepted residual, as a share of the residual under equal intensities
 
 MAX_ERROR = 0.035
@@ -69,7 +70,10 @@ def estimate_light_intensities(observations: Singles, missing: Bools | None, lig
     intensities = _alternate(values, known, light_vectors)
     if intensities is None:
         return None
-    predicted = shade(_fit(values, known, intensities, light_vectors), light_vectors)
+    normals = _fit(values, known, intensities, light_vectors)
+    if _equal_are_better(intensities, unit(normals), light_vectors):
+        return None
+    predicted = shade(normals, light_vectors)
     error = _error(values / intensities, predicted, known)
     return intensities if error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR) else None
 
@@ -115,19 +119,53 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     Under a tilt t, a plane that shows k_f needs intensities k_f / l_f . (t, 1). The likeliest tilt leaves intensities
     that are nearly equal, and is small itself. Of other objects, the intensities are returned as they are.
     """
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
-    if spread >= FLAT_SPREAD:
+    if not _is_flat(normals):
         return intensities
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
     shown = intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
-    tilt = np.zeros(2)
-    for _ in range(_TILT_FITS):
-        cosines = np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)
-        slopes, unequal = directions[:, :2] / cosines[:, None], np.log(shown / cosines)
-        slopes, unequal = slopes - slopes.mean(axis=0), unequal - unequal.mean()
-        certainty = TILT**2 / max(float(unequal.var()), _LEAST_VARIANCE)
-        tilt = tilt + np.linalg.solve(certainty * slopes.T @ slopes + np.eye(2), certainty * slopes.T @ unequal - tilt)
+    # How unequal the intensities are is measured where a tilt cannot explain it. Otherwise a tilt would count as
+    # inequality, and the more tilted an object is, the less its tilt would be believed.
+    tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
+    tilt = _fit_tilt(shown, directions, max(_variance(shown, directions, tilt), _LEAST_VARIANCE))
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
+
+
+def _is_flat(normals: Doubles) -> bool:
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1])) < FLAT_SPREAD
+
+
+def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -> bool:
+    """Return whether a flat object is nearer to its tilt under equal intensities than to the likeliest tilt."""
+    if not _is_flat(normals):
+        return False
+    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
+    shown = intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
+    tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
+    slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
+    error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
+    return bool(error < 2 * (_TRUSTED_TILTS * TILT) ** 2)
+
+
+def _variance(shown: Doubles, directions: Doubles, tilt: Doubles) -> float:
+    """Return the variance of the log intensities, from what no tilt explains."""
+    return float((_inequality(shown, directions, tilt) ** 2).sum()) / max(len(shown) - 3, 1)
+
+
+def _inequality(shown: Doubles, directions: Doubles, tilt: Doubles) -> Doubles:
+    """Return the logarithms (F,) of the intensities that a plane with this tilt needs to show what it does, mean 0."""
+    unequal = np.log(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
+    return np.asarray(unequal - unequal.mean())
+
+
+def _fit_tilt(shown: Doubles, directions: Doubles, variance: float) -> Doubles:
+    """Return the likeliest tilt (2,) of a plane if log intensities have this variance, and the tilt that of TILT."""
+    tilt, certainty = np.zeros(2), TILT**2 / variance
+    for _ in range(_TILT_FITS):
+        slopes = directions[:, :2] / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)[:, None]
+        slopes = slopes - slopes.mean(axis=0)
+        right = certainty * slopes.T @ _inequality(shown, directions, tilt) - tilt
+        tilt = tilt + np.linalg.solve(certainty * slopes.T @ slopes + np.eye(2), right)
+    return tilt
 
 
 def _fit(values: Doubles, known: Bools, intensities: Doubles, lights: Doubles) -> Doubles:

@@ -1,0 +1,255 @@
+"""Other readings of the images: encoded values, near lamps, unequal intensities, and light that every image has.
+
+Any one of them can be mistaken for another, so all are fitted to the same pixels and compared together. A matte model
+is fitted under each reading, and its residual is taken where the values are stored. The probability of a reading is
+
+    p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
+
+where the cost c is what a reading loses for its additional freedom and for being rare, and k how much the residuals of
+real materials, none of which is matte, are worth. Both were fitted to captures of all classes of materials with and
+without these faults (benchmarks/capture_faults.py --fit).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, get_args
+
+import numpy as np
+
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.robust_fit import fit_scaled_normals, lit_values, shade
+from splinecli.capture.sample import Sample
+from splinecli.maths.arrays import Doubles, Integers
+from splinecli.maths.normals import angle_between_deg, unit
+
+Kind = Literal["curve", "near", "offset", "intensities"]
+ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
+
+EXPONENTS = (1.4, 1.8, 2.2, 2.6)  # of gamma curves
+SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
+WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
+OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over what a pixel shows at right angles
+
+COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
+POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
+
+EIGHT_BIT = 0.8  # taken off the cost of a curve where images of 8 bits do not say that they are linear
+EQUAL_COST, EQUAL_SPREAD = 10.0, 0.15
+"""Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by the
+standard deviation of their logarithms."""
+
+ROUND, ROUND_COST = 0.85, 1.9
+"""On a ball, gloss varies with the place as the light of near lamps does. An object is round if its normals predict
+this share of the variance of the places; then near lamps cost so much more."""
+
+END_COST = 1.3  # of a distance at an end of WIDTHS, where the residual may fall beyond
+
+LIKELY = 0.5  # probability from which a reading is named
+
+_LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
+_MIN_LIGHTS, _LIGHTS_FOR_MEDIAN = 4, 8
+_MAX_PIXELS, _MAX_OBSERVATIONS, _MIN_PIXELS = 400, 16_000, 60
+_DARK_SHARE = 0.1  # of the brightest hundredth of the pixels; darker ones are background
+_SHADOW = 0.1  # share of a pixel's largest value; smaller values are shadow
+_ENCODED_SHADOW = 0.35  # the same if values are encoded
+_FITS, _FREE_FITS, _OFFSET_FITS = 8, 30, 14
+_HALVINGS = 3  # of the interval around the best constant light
+_EQUAL_WEIGHT_BELOW = 0.02
+_USUAL_COSINE = 0.8  # between a normal and the light under which its pixel is brightest
+_STEP = 1.5  # exponent of each change of intensities, which saves a third of the fits
+_LEAST = 1e-4  # added to residuals; 16 bits do not go below it
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A reading of the images, and how well it fits."""
+
+    kind: Kind
+    amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
+    residual: float  # as a share of the pixels' largest values
+    ratio: float  # residual over that of the given reading, on the same observations
+    normals: Doubles  # (p, 3), scaled, at the chosen pixels
+    intensities: Doubles  # (F,), mean 1; ones unless they are free
+    cost: float = 0.0  # what the reading loses beside COSTS
+
+    def evidence(self, *, eight_bit: bool = False) -> float:
+        """Return the logarithm of the probability over that of the given reading."""
+        cost = COSTS[self.kind] + self.cost - (EIGHT_BIT if eight_bit and self.kind == "curve" else 0)
+        if self.kind == "intensities":
+            spread = float(np.std(np.log(self.intensities)))
+            cost += EQUAL_COST * np.exp(-((spread / EQUAL_SPREAD) ** 2))
+        return -cost - POWERS[self.kind] * float(np.log(self.ratio))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    residual: float
+    normals: Doubles
+    intensities: Doubles
+
+
+class Readings:
+    """The pixels of a sample, and the readings that were fitted to them.
+
+    Args:
+        sample: its observations are as stored, not divided by intensities.
+        lights: (F, 3), unit.
+        intensities: (F,), those that were measured; None for equal ones.
+    """
+
+    def __init__(self, sample: Sample, lights: Doubles, intensities: Doubles | None = None) -> None:
+        n_lights = len(lights)
+        chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+        values = values.clip(min=0)
+        # Three unknowns, and some more values that can contradict them.
+        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
+        self.values, self.lights, self.intensities = values[enough], lights, intensities
+        self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
+        self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
+        self.shape = sample.mask.shape
+        self.are_enough = n_lights >= _MIN_LIGHTS and len(self.values) >= _MIN_PIXELS
+
+    def fit(self, kinds: Collection[Kind]) -> list[Reading]:
+        """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
+        if not self.are_enough:
+            return []
+        kinds = [kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]]
+        vectors = self._with(self.lights)
+        given = _fit(self.values, vectors)
+        found = []
+        if "curve" in kinds:
+            found.append(self._best_curve(free=False))
+        if "near" in kinds:
+            found.append(self._best_near())
+        if "offset" in kinds:
+            found.append(_best("offset", self._offset_fits(vectors), given))
+        if "intensities" in kinds:
+            found.append(_best("intensities", {1.0: _fit(self.values, vectors, free=True)}, given))
+        return found
+
+    def likeliest(self, kinds: Collection[Kind], *, eight_bit: bool = False) -> tuple[Reading, float] | None:
+        """Return the reading of these kinds that fits best, and its probability; None if nothing can be said."""
+        found = self.fit(kinds)
+        if not found:
+            return None
+        evidence = np.array([0.0, *(reading.evidence(eight_bit=eight_bit) for reading in found)])
+        shares = np.exp(evidence - np.logaddexp.reduce(evidence))
+        first = int(np.argmax(shares[1:]))
+        best, probability = found[first], float(shares[1 + first])
+        if best.kind == "intensities" and "curve" in kinds and probability > LIKELY:
+            # Unequal lamps may hide a curve.
+            curve = self._best_curve(free=True)
+            share = float(1 / (1 + np.exp(-curve.evidence(eight_bit=eight_bit))))
+            if share > LIKELY:
+                return curve, share * probability
+        return best, probability
+
+    def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
+        """Return the median angle in degrees between the normals of a reading and those of the given one.
+
+        `used` are the intensities (F,) that were estimated and are divided out; None for none.
+        """
+        lights = self.lights if used is None else self.lights * used[:, None]
+        given = _fit(self.values, self._with(lights))
+        return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
+
+    def _best_curve(self, *, free: bool) -> Reading:
+        vectors, shadow = self._with(self.lights), _ENCODED_SHADOW
+        given = _fit(self.values, vectors, free=free, shadow=shadow)
+        fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in EXPONENTS}
+        return _best("curve", fits, given)
+
+    def _best_near(self) -> Reading:
+        """Return the best distance. Intensities are free: near lamps look unequal, and lamps that are may be near."""
+        given = _fit(self.values, self._with(self.lights), free=True)
+        fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
+        best = _best("near", fits, given)
+        round_cost = ROUND_COST if _roundness(best.normals, np.stack((self.columns, -self.rows), axis=1)) > ROUND else 0
+        return replace(best, cost=round_cost + (END_COST if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0))
+
+    def _offset_fits(self, vectors: Doubles) -> dict[float, _Fit]:
+        """Return fits with constant light, also between the two of OFFSETS around the best one."""
+        fits = {offset: _fit(self.values, vectors, offset=offset) for offset in OFFSETS}
+        for _ in range(_HALVINGS):
+            tried = sorted(fits)
+            best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
+            for one, other in pairwise(tried[max(best - 1, 0) : best + 2]):
+                between = float(np.sqrt(one * other))
+                fits[between] = _fit(self.values, vectors, offset=between)
+        return fits
+
+    def _near(self, widths: float) -> Doubles:
+        lamps = NearLamps.of(self.lights * widths * self.width, 1.0, self.shape, equal=True)
+        directions, attenuations = lamps.light_at(lamps.plane_points(self.rows, self.columns))
+        return np.asarray(directions * attenuations[..., None], np.float64)
+
+    def _with(self, lights: Doubles) -> Doubles:
+        return lights if self.intensities is None else lights * self.intensities[:, None]
+
+
+def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit) -> Reading:
+    amount = min(fits, key=lambda each: fits[each].residual)
+    found = fits[amount]
+    ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
+    return Reading(kind, amount, found.residual, ratio, found.normals, found.intensities)
+
+
+def _fit(
+    values: Doubles,
+    lights: Doubles,
+    gamma: float = 1.0,
+    *,
+    offset: float = 0.0,
+    free: bool = False,
+    shadow: float = _SHADOW,
+) -> _Fit:
+    """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
+
+    Values (p, F) are scaled to 1; lights are (F, 3) or (p, F, 3), of any length. Intensities e are 1 or free.
+    """
+    lit = (values > shadow).astype(np.float64)
+    observed = values**gamma
+    # The slope of the linear value over the stored one, so that all readings have the same errors.
+    weights = start = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1))
+    intensities = np.ones(values.shape[1])
+    if offset:
+        above = np.maximum(observed - offset / (offset + _USUAL_COSINE), 0)
+        normals = fit_scaled_normals(above, start, lights)
+    for _ in range(_OFFSET_FITS if offset else _FREE_FITS if free else _FITS):
+        if offset:
+            facing = (shade(normals, lights) > 0)[..., None]
+            # Newton's step on |b|, halved: with much constant light, whole steps miss.
+            next_normals = fit_scaled_normals(observed, weights, facing * lights + offset * unit(normals)[:, None])
+            normals = (normals + next_normals) / 2
+            predicted = np.maximum(shade(normals, lights), 0) + offset * np.linalg.norm(normals, axis=1, keepdims=True)
+        else:
+            normals = fit_scaled_normals(observed, weights, lights * intensities[:, None])
+            predicted = shade(normals, lights) * intensities
+        weights = start / (np.abs(observed - predicted) + _EQUAL_WEIGHT_BELOW)
+        if free:
+            intensities = _intensities(observed, predicted / intensities, weights, intensities)
+    residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
+    # The fits to few lights pass through most values. The median would be zero.
+    typical = np.median(residuals) if values.shape[1] >= _LIGHTS_FOR_MEDIAN else residuals.mean()
+    return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
+
+
+def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Doubles) -> Doubles:
+    """Return the next intensities (F,) from what lights of intensity 1 would give, (p, F)."""
+    weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
+    power = (weights * equal**2).sum(axis=0)
+    found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
+    found = np.clip(found / found.mean(), 0.05, 20)
+    intensities = before * (found / before) ** _STEP
+    return np.asarray(intensities / intensities.mean())
+
+
+def _roundness(normals: Doubles, places: Integers) -> float:
+    """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
+    across = unit(normals)[:, :2]
+    terms = np.concatenate((across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1)
+    missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
+    return float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
