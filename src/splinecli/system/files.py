@@ -145,20 +145,33 @@ def _whole_number(digits: str) -> int:
     return int(digits)
 
 
+class NoRoomError(OutputError):
+    """The disk is full or read-only. Other folders would fail, too, so a batch ends."""
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
     """Turn an OSError inside the context into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
-        # NumPy tells only how much was written.
+        # NumPy states only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
-        raise OutputError(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
+        kind = NoRoomError if error.errno in (None, *_NO_ROOM) else OutputError
+        raise kind(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
 
 
-def as_input_error(error: OSError, folder: Path) -> InputError:
-    """Return what a system's refusal to read a capture means for the user."""
-    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
+def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
+    """Return what a system's refusal outside of refusals_as_output_errors means: that a file cannot be read.
+
+    `path` is named where the error names none.
+    """
+    if error.errno in _NO_ROOM:
+        return NoRoomError(f"cannot be written ({error.strerror})", path=error.filename or path)
+    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or path)
 
 
 def check_writable(folder: Path) -> None:
