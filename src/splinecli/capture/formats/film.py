@@ -5,10 +5,11 @@ Of hundreds of frames, few are needed: sharp ones, not overexposed, whose light 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +88,10 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
             with native_stderr():  # not longer, because it stops progress bars, too
                 while place <= number and video.grab():
                     place += 1
-            if place <= number:
-                raise ValueError
-            yield np.ascontiguousarray(_picture(video)[..., ::-1])
+                if place <= number:
+                    raise ValueError
+                picture = np.ascontiguousarray(_picture(video)[..., ::-1])
+            yield picture
 
 
 def _candidates(film: Path) -> list[_Candidate]:
@@ -156,18 +158,32 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
     with damage_as_input_error(film, problem, "Copy it again, or convert it to MP4 with H.264"):
         with film.open("rb") as file:
             start = file.read(16)
-        if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
-        with native_stderr():
-            video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
-        try:
-            if not video.isOpened():
-                raise ValueError
-            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
-            check_stored_size(size, 1, film)
-            yield video
-        finally:
-            video.release()
+            if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+                raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+            file.seek(0)
+            # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
+            os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+            with native_stderr():
+                video = cv2.VideoCapture(_utf8_name(film, file), cv2.CAP_FFMPEG)
+            try:
+                if not video.isOpened():
+                    raise ValueError
+                size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+                check_stored_size(size, 1, film)
+                yield video
+            finally:
+                with native_stderr():
+                    video.release()
+
+
+def _utf8_name(path: Path, file: BinaryIO) -> str:
+    """Return the path of an open file, or another name of it where that is not UTF-8: OpenCV would crash."""
+    name = str(path.absolute())
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return f"/dev/fd/{file.fileno()}"
+    return name
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
