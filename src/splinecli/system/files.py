@@ -50,6 +50,16 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
     return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
 
+def utf8_name(path: Path, file: IO[bytes]) -> str:
+    """Return the path of an open file for a C library; another name if it is not UTF-8, which some crash on."""
+    name = str(path.absolute())
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return f"/dev/fd/{file.fileno()}"
+    return name
+
+
 def create_hidden(folder: Path) -> IO[bytes]:
     """Return a new hidden file of a random name in the folder, open for writing. Raises OSError."""
     # Mode x neither opens what is there nor follows a link.

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from splinecli.errors import InputError
 from splinecli.maths.arrays import Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
+from splinecli.system.files import utf8_name
 
 if TYPE_CHECKING:
     import cv2
@@ -164,7 +165,7 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
             # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
             os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
             with native_stderr():
-                video = cv2.VideoCapture(_utf8_name(film, file), cv2.CAP_FFMPEG)
+                video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
             try:
                 if not video.isOpened():
                     raise ValueError
@@ -174,16 +175,6 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
             finally:
                 with native_stderr():
                     video.release()
-
-
-def _utf8_name(path: Path, file: BinaryIO) -> str:
-    """Return the path of an open file, or another name of it where that is not UTF-8: OpenCV would crash."""
-    name = str(path.absolute())
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return f"/dev/fd/{file.fileno()}"
-    return name
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
