@@ -156,25 +156,25 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
 
     check_file(film, "a film")
     problem = "the film is damaged, or in a form that cannot be read"
-    with damage_as_input_error(film, problem, "Copy it again, or convert it to MP4 with H.264"):
-        with film.open("rb") as file:
-            start = file.read(16)
-            if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-                raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
-            file.seek(0)
-            # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
-            os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+    hint = "Copy it again, or convert it to MP4 with H.264"
+    with damage_as_input_error(film, problem, hint), film.open("rb") as file:
+        start = file.read(16)
+        if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+        file.seek(0)
+        # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+        with native_stderr():
+            video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
+        try:
+            if not video.isOpened():
+                raise ValueError
+            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+            check_stored_size(size, 1, film)
+            yield video
+        finally:
             with native_stderr():
-                video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
-            try:
-                if not video.isOpened():
-                    raise ValueError
-                size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
-                check_stored_size(size, 1, film)
-                yield video
-            finally:
-                with native_stderr():
-                    video.release()
+                video.release()
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
