@@ -18,7 +18,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import CaptureHead
 from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
-from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name, write_bytes
+from splinecli.system.files import expanded, file_sha256, is_special, parse_json, utf8_name, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
@@ -192,7 +192,7 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
     """Load shipped weights by name, or a weight file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
-        path = Path(name_or_file).expanduser()
+        path = expanded(name_or_file)
         if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
             names = ", ".join(shipped_names())
             raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")

@@ -50,6 +50,11 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
     return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
 
+def expanded(path: str) -> Path:
+    """Return the path with ~ replaced by the home folder, unless there is none."""
+    return Path(os.path.expanduser(path))  # noqa: PTH111 - Path.expanduser raises for an unknown user
+
+
 def utf8_name(path: Path, file: IO[bytes]) -> str:
     """Return the path of an open file for a C library; another name if it is not UTF-8, which some crash on."""
     name = str(path.absolute())
