@@ -20,7 +20,7 @@ from kills import content, killed_at
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED
-from splinecli.system.publishing import LOCK, UNDONE, BusyError, held_folder, locked, new_files
+from splinecli.system.publishing import LOCK, UNDONE, BusyError, held_folder, locked, locked_file, new_files
 
 REPORT = "report.json"
 
@@ -250,6 +250,18 @@ def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path: Path) -> No
         children.append(child)
     assert all(os.waitpid(child, 0)[1] == 0 for child in children)
     assert number.read_text() == "60"
+
+
+def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path: Path) -> None:
+    running, left = (tmp_path / f".{name}.splinecli-unfinished" for name in ("running", "left"))
+    left.touch()
+    warnings: list[str] = []
+    with locked_file(running):
+        with held_folder(tmp_path, warnings.append):
+            assert running.exists() and not left.exists()
+        with held_folder(tmp_path, warnings.append):
+            assert running.exists()
+    assert len(warnings) == 1 and not any(tmp_path.iterdir())
 
 
 def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

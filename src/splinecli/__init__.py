@@ -72,7 +72,7 @@ def estimate_normals(
         weights: name or file of a network's weights. None is the method's own.
         rotations: number of rotations of the lights whose normals a network averages. None is the method's own.
         distil: let a small network learn the method on a sample of the pixels and estimate the rest. False uses the
-            method on every pixel; None takes the faster way for 100,000 pixels and more.
+            method on every pixel; None distils for 100,000 pixels and more.
         batch_size: pixels per batch. None is the method's own.
         device: where to compute; "auto" is a CUDA GPU if there is one.
         precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.

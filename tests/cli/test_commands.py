@@ -1,5 +1,6 @@
 """What all commands share: panels in the help, `~` in paths, closed pipes, and threads that sleep while they wait."""
 
+import errno
 import json
 import os
 import subprocess
@@ -11,6 +12,7 @@ import typer
 
 from cli.test_schema import check
 from splinecli.cli.commands import OTHERS, sort_into_panels
+from splinecli.cli.failures import explain
 from splinecli.cli.main import app
 
 COMMANDS = typer.main.get_command(app).commands
@@ -107,3 +109,16 @@ def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expecte
     call = [sys.executable, "-c", script]
     done = subprocess.run(call, capture_output=True, text=True, check=True, env={**clean, **variables})
     assert done.stdout.splitlines()[-1] == str(expected)
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "lights.txt"), ("lights.txt: cannot be read", 3)),
+        (OSError(errno.EIO, "Input/output error"), ("cannot be read (Input/output error)", 3)),
+        (OSError(errno.ENOSPC, "No space left on device", "out"), ("out: cannot be written", 5)),
+    ],
+)
+def test_an_error_of_the_system_that_no_command_expected(error, expected):
+    message, code = explain(error)
+    assert message.startswith(expected[0]) and code == expected[1]

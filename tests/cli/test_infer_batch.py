@@ -17,7 +17,7 @@ import pytest
 from capture.layouts.test_cyclesps import write_object
 from cli.conftest import read_report
 from splinecli.capture import source
-from splinecli.errors import InputError, OutputError, UsageError
+from splinecli.errors import InputError, UsageError
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline import estimate, infer
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
@@ -25,6 +25,7 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
 from splinecli.results import files, report
+from splinecli.system.files import NoRoomError
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
@@ -324,7 +325,21 @@ def test_what_is_no_folder_is_the_failure_of_its_capture(capture, run):
     assert gone.err.endswith("2 captures: 1 done, 1 missing; see out/index.html\n")
 
 
-@pytest.mark.parametrize("error", [OutputError("full"), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_folders_that_cannot_be_written_do_not_end_a_batch(make_capture, run_without_privileges, workers):
+    names = ["closed", "file", "good"]
+    for name in names:
+        make_capture(name)
+    Path("out/closed").mkdir(parents=True, mode=0o555)
+    Path("out/file").write_text("mine")
+    result = run_without_privileges("infer", *names, "--method", "ls", "--jsonl", "--workers", workers)
+    found = {document["capture"]: document for document in map(json.loads, result.out.splitlines())}
+    assert (result.code, found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5, 5)
+    assert found["closed"]["error"].startswith("out/closed: no permission to write into this folder")
+    assert found["good"] == read_report(Path("out/good"))
+
+
+@pytest.mark.parametrize("error", [NoRoomError("full"), OSError(errno.ENOSPC, "No space left on device")])
 def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch):
     monkeypatch.setattr("splinecli.results.files.write_estimate", Mock(side_effect=error))
     result = run("infer", capture, make_capture("second"), "--method", "ls", "--json")

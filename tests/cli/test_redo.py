@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import read_report
+from splinecli.networks.weights import save_weights
+from splinecli.pipeline.batch import infer_batch
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
+from tiny_networks import random_network
 
 
 def test_refuses_to_overwrite(capture, run, golden):
@@ -179,3 +183,14 @@ def test_files_of_the_user_in_the_capture_are_kept(capture, run):
         result = run("infer", capture, "--method", "ls", "-o", capture.parent, *update)
         assert result.code == 5 and "sphere: contains normals.png, but no report.json" in result.err
     assert (capture / "normals.png").read_text() == "drawn by hand"
+
+
+def test_other_weights_in_the_home_folder(capture, monkeypatch, tmp_path):
+    """The command line expands `~`; from Python, it arrives as it is."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    options = InferOptions(weights="~/w.safetensors")
+    for width, status in ((8, "done"), (8, "skipped"), (16, "changed")):
+        save_weights(random_network(width=width), tmp_path / "w.safetensors")
+        (outcome,) = infer_batch([capture], options)
+        assert outcome.status == status

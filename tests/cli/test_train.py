@@ -63,6 +63,14 @@ def test_a_run_and_its_continuation(run, monkeypatch):
     monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet") == type(result)(0, "", "")
     assert [row["step"] for row in rows()] == ["3", "5"]
+    # A name that is not UTF-8, which the library of the weights does not take.
+    other = os.fsdecode(b"r\xffn")
+    try:
+        Path("run").rename(other)
+    except OSError:
+        pytest.skip("the file system has no such names")
+    assert run("train", "-o", other, "--resume", "--steps", 5, "--quiet").code == 0
+    Path(other).rename("run")
     # Settings may be repeated if they are those of the run.
     again = ["--resume", "--steps", 6, "--preset", "compact", "--seed", 0, "--quiet"]
     assert run("train", "-o", "run", *again).code == 0

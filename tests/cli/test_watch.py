@@ -28,12 +28,16 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
 
         monkeypatch.setattr(watch.time, "sleep", sleep)
 
-    look([copy_first, lambda: (parts / "-first 1/done").touch()])
+    # Meanwhile, the folder is away for two looks.
+    steps = [lambda: parts.rename("away"), lambda: None, lambda: Path("away").rename(parts)]
+    look([*steps, copy_first, lambda: (parts / "-first 1/done").touch()])
     command = ("watch", parts, "--marker", "done", "--", "--method", "ls", "--jsonl", "-o", "out")
     result = run(*command)
     assert result.code == 130
-    failed, done = map(json.loads, result.out.splitlines())
-    assert (failed["capture"], failed["exit_code"]) == ("bad", 3)
+    failed, again, done = map(json.loads, result.out.splitlines())
+    assert (failed["capture"], failed["exit_code"]) == ("bad", 3) and again == failed
+    assert result.err.count("parts: the folder cannot be read (No such file or directory). Waiting for it.") == 1
+    assert "parts: the folder is there again" in result.err
     assert (done["capture"], done["method"]) == ("-first 1", "ls")
     before = Path("out/-first 1/report.json").stat()
     look([])

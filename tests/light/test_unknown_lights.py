@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -55,6 +56,20 @@ def test_intensities_are_found_with_the_directions() -> None:
     assert found.intensities is not None and found.intensities.mean() == pytest.approx(1)
     assert mean_angle(found.directions, true) < 6
     assert np.abs(found.intensities / intensities - 1).mean() < 0.5 * np.abs(intensities - 1).mean()
+
+
+def test_the_number_of_threads_changes_nothing() -> None:
+    """Rounding alone could move a light into another cell of an observation map."""
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(find_lights(observed(lights()), INSIDE, True).directions)
+    finally:
+        torch.set_num_threads(before)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
 
 
 def test_a_turned_camera_turns_the_lights() -> None:

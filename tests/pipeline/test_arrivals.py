@@ -62,6 +62,41 @@ def test_a_marker_needs_no_time(tmp_path: Path) -> None:
     assert arrivals.take() == []
 
 
+def test_films_are_complete_when_they_no_longer_change(tmp_path: Path) -> None:
+    clock = Clock()
+    arrivals = Arrivals(tmp_path, marker="done", seconds=5, without=tmp_path / "out", clock=clock)
+    for name in ("clip.mp4", "clip/done", "other.MOV", ".hidden.mp4", "notes.txt"):
+        put(tmp_path / name)
+    assert arrivals.take() == [tmp_path / "clip"]
+    clock.seconds = 4
+    put(tmp_path / "other.MOV", "a longer film")
+    clock.seconds = 6
+    assert arrivals.take() == [tmp_path / "clip.mp4"]
+    clock.seconds = 12
+    assert arrivals.take() == [tmp_path / "other.MOV"]
+    assert arrivals.take() == []
+
+
+def test_captures_of_one_name_come_one_after_the_other(tmp_path: Path) -> None:
+    """Together they would end the batch."""
+    arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
+    for name in ("clip.mp4", "clip/1.png"):
+        put(tmp_path / name)
+    found = [arrivals.take() for _ in range(3)]
+    assert [len(paths) for paths in found] == [1, 1, 0] and found[0] != found[1]
+
+
+def test_a_folder_that_vanishes_for_a_moment(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path / "parts", marker=None, seconds=0, without=tmp_path / "out")
+    put(tmp_path / "parts/a/1.png")
+    assert arrivals.take() == [tmp_path / "parts/a"]
+    (tmp_path / "parts").rename(tmp_path / "away")
+    with pytest.raises(InputError, match="the folder cannot be read"):
+        arrivals.take()
+    (tmp_path / "away").rename(tmp_path / "parts")
+    assert arrivals.take() == [tmp_path / "parts/a"]
+
+
 def test_a_folder_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the folder cannot be read"):
         Arrivals(tmp_path / "nowhere", marker=None, seconds=0, without=tmp_path).take()

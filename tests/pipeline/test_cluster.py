@@ -23,7 +23,7 @@ from splinecli.pipeline import distribution as distribution_module
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
 from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import Distributor, Item, LostError, Work
+from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Member, list_captures
 from splinecli.pipeline.observer import SILENT
@@ -196,6 +196,17 @@ def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
     assert out.count("\n") == 4 and err.endswith("4 captures: 4 done; see out/index.html\n")
 
 
+def test_shards_side_by_side_share_a_folder(cluster, tmp_path, capfd):
+    """Another batch that writes the index of the folder leaves the mark by which workers know it."""
+    call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls", "-o", "out"]
+    options = ClusterOptions(address=cluster.scheduler_address)
+    with distributor(partial(worker_tasks.double, "out"), Path("out"), options, SILENT) as workers:
+        assert main([*call, "--shard", "1/2"]) == 0
+        assert [result for _, result in workers.run(numbered(range(2)))] in ([0, 2], [2, 0])
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a", "c", "index.html"]
+    assert "unfinished" not in capfd.readouterr().err
+
+
 def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     folders = [Path(name) for name in write_captures(["a"])]
     weights = SimpleNamespace(weights={"sha256": "1234"})
@@ -206,13 +217,14 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     assert not Path("out").exists()
 
 
-def test_an_output_that_cannot_be_written_ends_the_batch(cluster, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_does_not_end_the_batch(cluster, tmp_path, monkeypatch):
     folders = [Path(name) for name in write_captures(["a", "b"])]
     Path("out").mkdir()
     Path("out/a").write_text("a file")
     options = ClusterOptions(address=cluster.scheduler_address)
-    with pytest.raises(OutputError, match=r"out/a: .*\(on the worker tcp://"):
-        list(infer_batch(folders, InferOptions(method="ls"), cluster=options))
+    outcomes = infer_batch(folders, InferOptions(method="ls"), cluster=options)
+    found = {outcome.report["capture"]: (outcome.status, outcome.exit_code) for outcome in outcomes}
+    assert found == {"a": ("failed", 5), "b": ("done", 0)}
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ import typer
 
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.cli.shared import listed
-from splinecli.errors import OutputError, SplinecliError, UsageError
+from splinecli.errors import SplinecliError, UsageError
+from splinecli.system.files import as_splinecli_error
 from splinecli.system.memory import is_out_of_memory
 
 DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
@@ -44,8 +45,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if is_out_of_memory(error):
         return NO_MEMORY, SplinecliError.exit_code
     if isinstance(error, OSError):
-        place = f"{error.filename}: " if error.filename else ""
-        return f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code
+        return explain(as_splinecli_error(error))
     return DEFECT, SplinecliError.exit_code
 
 

@@ -71,7 +71,7 @@ def infer(
         None,
         "--distil/--exact",
         help="Let a small network learn the method on a sample of the pixels and estimate the rest, or use the method"
-        " on every pixel. [default: the faster one from 100,000 pixels, else --exact]",
+        " on every pixel. [default: --distil from 100,000 pixels, else --exact]",
     ),
     device: shared.Device = shared.DEVICE,
     precision: shared.Precision = shared.PRECISION,

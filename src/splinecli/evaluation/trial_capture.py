@@ -27,7 +27,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
-from splinecli.system.files import as_input_error
+from splinecli.system.files import as_splinecli_error
 from splinecli.system.progress import Progress
 
 _RETILTS = 100
@@ -160,7 +160,7 @@ class CaptureReading:
         try:
             stored = source.read_stored(self.lights, lambda: on_image(next(numbers), len(self.lights)))
         except OSError as error:
-            raise as_input_error(error, self.folder) from error
+            raise as_splinecli_error(error, self.folder) from error
         first = self.protocols[0]
         rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
         as_stored = all(protocol.as_stored for protocol in self.protocols)
@@ -180,7 +180,7 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
     try:
         return open_capture(folder, white_level=protocol.white_level)
     except OSError as error:
-        raise as_input_error(error, folder) from error
+        raise as_splinecli_error(error, folder) from error
 
 
 def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from splinecli.errors import InputError, check_one_of
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
 from splinecli.networks.weights import light_net
+from splinecli.system.side_by_side import side_by_side
 
 LARGEST_ERROR_DEG = 20.0
 """Lights with a larger expected error on average are refused: their normals would be worth little."""
@@ -146,8 +147,8 @@ def _ask_network(
     images = torch.stack(small)
     images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
     network = light_net()
-    with torch.inference_mode():
-        guesses = [_view(network, images, inside, turns, mirrored) for turns, mirrored in _VIEWS]
+    # One thread each, so that the number of threads does not change the rounding.
+    guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
     directions, sharpness, log_intensities = (torch.cat(part).double() for part in zip(*guesses, strict=True))
     towards = (sharpness.exp()[..., None] * directions).sum(dim=0)
     mean = torch.nn.functional.normalize(towards, dim=-1)

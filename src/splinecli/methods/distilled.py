@@ -6,7 +6,6 @@ at some 80 times the speed. What the perceptron does not follow is mostly the ne
 Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +29,7 @@ from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.methods.pixel_sample import PixelSample, draw_sample
 from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize
 from splinecli.networks.error_head import median_error_deg
-from splinecli.networks.perceptron import BATCH, Perceptron
+from splinecli.networks.perceptron import Perceptron
 from splinecli.system.progress import Progress
 from splinecli.system.side_by_side import side_by_side
 
@@ -205,16 +204,3 @@ def _inputs(
 ) -> torch.Tensor:
     lights = torch.as_tensor(light_directions, dtype=torch.float32, device=device)
     return perceptron.inputs(torch.as_tensor(observations).to(device), lights)
-
-
-def seconds_of_learning(light_directions: Directions, size: StudentSize, device: str) -> float:
-    """Measure a few steps of learning, and return the time of all. The network's time on the sample comes on top."""
-    generator = torch.Generator().manual_seed(0)
-    lights = torch.as_tensor(light_directions, dtype=torch.float32)
-    perceptron = Perceptron(lights, size.width, generator).to(device)
-    inputs = torch.rand(BATCH, len(perceptron.mean), generator=generator).to(device)
-    for steps in (2, 10):  # the first steps take longer
-        started = time.perf_counter()
-        perceptron.learn(inputs, inputs[:, -3:], inputs[:, :2], steps=steps, generator=generator)
-        seconds = (time.perf_counter() - started) / steps
-    return seconds * size.steps

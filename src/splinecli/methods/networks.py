@@ -20,6 +20,7 @@ from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
+from splinecli.system.side_by_side import one_thread_each
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -91,7 +92,9 @@ class NetworkEstimator:
             for values in (light.observations[rows], directions_at(light.directions, rows))
         )
         found = copy.copy(self)
-        with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+        # One thread, so that the number of threads does not change the rounding.
+        bfloat16 = torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16")
+        with one_thread_each(), bfloat16:
             found._contexts = [self.network.look_at(sample, lights, rotation) for rotation in self._rotations]
         return found
 

@@ -18,7 +18,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import CaptureHead
 from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
-from splinecli.system.files import file_sha256, is_special, parse_json, write_bytes
+from splinecli.system.files import expanded, file_sha256, is_special, parse_json, utf8_name, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
@@ -97,13 +97,13 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
         with path.open("rb") as start:
             if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > _LONGEST_HEADER:
                 raise SafetensorError(f"a header of {length} bytes")
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            found = metadata.get("format", "none")
-            if found != expected_format:
-                problem = f"wrong format: found {found}, expected {expected_format}"
-                raise ModelError(problem, path=path, hint=hint)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            with safe_open(utf8_name(path, start), framework="pt") as file:
+                metadata = file.metadata() or {}
+                found = metadata.get("format", "none")
+                if found != expected_format:
+                    problem = f"wrong format: found {found}, expected {expected_format}"
+                    raise ModelError(problem, path=path, hint=hint)
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
         raise ModelError(f"not a safetensors file, or cut short ({error})", path=path, hint=hint) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
@@ -192,7 +192,7 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
     """Load shipped weights by name, or a weight file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
-        path = Path(name_or_file).expanduser()
+        path = expanded(name_or_file)
         if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
             names = ", ".join(shipped_names())
             raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from splinecli.capture.formats.film import is_film
 from splinecli.capture.layouts.capture_files import natural_key
 from splinecli.errors import InputError
 
@@ -22,12 +23,12 @@ class _Seen:
 
 
 class Arrivals:
-    """The captures in a folder, its subfolders, that are complete and were not returned before.
+    """The captures in a folder, its subfolders and films, that are complete and were not returned before.
 
-    A capture is complete when it contains a file named `marker`, or, without a marker, when nothing in it has changed
-    for `seconds`. Folders whose names begin with a dot are left out, and `without`, such as the folder of the results,
-    which is no capture and lies in none. One that changes after it was returned is returned again. `clock` never goes
-    back.
+    A capture is complete when it contains a file named `marker`, or, without a marker, and for a film, when nothing in
+    it has changed for `seconds`. Names that begin with a dot are left out, and `without`, such as the folder of the
+    results, which is no capture and lies in none. One that changes after it was returned is returned again. `clock`
+    never goes back.
     """
 
     def __init__(
@@ -47,11 +48,12 @@ class Arrivals:
     def take(self) -> list[Path]:
         """Return the captures that became complete since the last call, in natural order of their names.
 
-        Raises InputError if the folder cannot be read.
+        Of two whose results have one name, such as a folder and a film, the second comes with the next call. Raises
+        InputError if the folder cannot be read; later, all captures in it are returned again.
         """
-        found = {path: _stamp(path) for path in self._subfolders()}
+        found = {path: _stamp(path) for path in self._captures()}
         self._seen = {path: seen for path, seen in self._seen.items() if path in found}
-        ready = []
+        ready: dict[str, Path] = {}
         for path, stamp in found.items():
             seen = self._seen.get(path)
             if seen is None or seen.stamp != stamp:
@@ -59,24 +61,28 @@ class Arrivals:
             if not stamp[0] or seen.returned:
                 continue
             unchanged = self._clock() - seen.since >= self.seconds
-            seen.returned = unchanged if self.marker is None else (path / self.marker).exists()
-            if seen.returned:
-                ready.append(path)
-        return sorted(ready, key=natural_key)
+            by_time = self.marker is None or is_film(path)
+            complete = unchanged if by_time else os.path.exists(path / str(self.marker))  # noqa: PTH110 - never raises
+            name = path.stem if is_film(path) else path.name
+            seen.returned = complete and ready.setdefault(name, path) is path
+        return sorted(ready.values(), key=natural_key)
 
-    def _subfolders(self) -> list[Path]:
+    def _captures(self) -> list[Path]:
         try:
             with os.scandir(self.folder) as entries:
-                folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
+                visible = [(entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."]
         except OSError as error:
+            self._seen.clear()  # a capture that was being read has failed, and is to be tried again
             raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
-        return [folder for folder in folders if folder.resolve() not in self._left_out]
+        paths = [path for is_dir, path in visible if is_dir or is_film(path)]
+        return [path for path in paths if path.resolve() not in self._left_out]
 
 
-def _stamp(folder: Path) -> Stamp:
-    """Return the stamp of all files below a folder. Those that vanish meanwhile do not count."""
+def _stamp(capture: Path) -> Stamp:
+    """Return the stamp of a film, or of all files below a folder. Those that vanish meanwhile do not count."""
     count = size = newest = 0
-    for place, _, names in os.walk(folder):
+    film = ("", (), [os.fspath(capture)])
+    for place, _, names in [film] if is_film(capture) else os.walk(capture):
         for name in names:
             try:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second

@@ -45,7 +45,7 @@ def infer_batch(
             exist is the name of a map, format or method.
         InputError: a file that the options name does not exist.
         ModelError: the weights cannot be used.
-        OutputError: the output folder cannot be written, or the disk is full.
+        OutputError: the output folder cannot be written, or the disk is full. A single folder in it only fails.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
     members = list_captures(folders, shard)

@@ -25,6 +25,7 @@ from splinecli.pipeline.observer import Observer
 from splinecli.system.extras import import_extra
 from splinecli.system.files import UNFINISHED, made_folder, refusals_as_output_errors
 from splinecli.system.memory import available_memory, keep_freed_memory
+from splinecli.system.publishing import locked_file
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -235,10 +236,7 @@ def distributor(
     with ExitStack() as stack:
         with refusals_as_output_errors(output):
             stack.enter_context(made_folder(output))
-            probe.touch()
-        try:
-            with connected(options) as client:
-                yield Distributor(client, Work(do, str(probe.absolute())), options, observer)
-        finally:
-            with suppress(OSError):
-                probe.unlink(missing_ok=True)
+            # Locked, so that no other batch takes it for the file of a killed process, and removes it.
+            stack.enter_context(locked_file(probe, wait=True))
+        client = stack.enter_context(connected(options))
+        yield Distributor(client, Work(do, str(probe.absolute())), options, observer)

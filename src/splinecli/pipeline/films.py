@@ -7,12 +7,12 @@ from typing import Literal
 
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.capture.stamp import digest, stamp_content
-from splinecli.errors import UsageError
+from splinecli.errors import OutputError, UsageError
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.infer_options import Reading
 from splinecli.pipeline.observer import Observer
 from splinecli.system.files import read_json
-from splinecli.system.publishing import RefusedFolderError, held_folder, is_plain, new_files, refuse_link
+from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
 FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
 _RECORD = "film.json"
@@ -30,8 +30,7 @@ def unpacked(
     Raises:
         UsageError: the lights of a film are not to be found from its images.
         InputError: the film cannot be read, or its light does not move.
-        RefusedFolderError: the folder has frames of another film, or other files.
-        OutputError: the frames cannot be written.
+        OutputError: the folder has frames of another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
@@ -46,7 +45,7 @@ def unpacked(
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            raise RefusedFolderError(
+            raise OutputError(
                 f"contains {others[0]}, which is no frame of this film",
                 path=folder,
                 hint="Move it, or choose another -o",
@@ -55,7 +54,7 @@ def unpacked(
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
-            raise RefusedFolderError(
+            raise OutputError(
                 "contains the frames of another film, or of an earlier version of this one",
                 path=folder,
                 hint="Add --update to take those of this film, or choose another place with -o",

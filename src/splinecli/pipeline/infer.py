@@ -33,7 +33,7 @@ from splinecli.results.report import Clock, report_of
 from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
-from splinecli.system.files import file_sha256
+from splinecli.system.files import expanded, file_sha256
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 
@@ -94,8 +94,8 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
     `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
     """
-    if weights is not None and Path(weights).is_file():
-        weights = loaded or file_sha256(Path(weights))
+    if weights is not None and (path := expanded(weights)).is_file():
+        weights = loaded or file_sha256(path)
     return digest([*source.stamp, weights])
 
 

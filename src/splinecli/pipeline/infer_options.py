@@ -159,7 +159,7 @@ class InferOptions(Reading):
 
     Args:
         n_lights: None for all. light_indices: counted from 0.
-        distil: False for the method on every pixel, None for the faster way.
+        distil: False for the method on every pixel, None for distillation of large captures only.
         formats, maps: names of `splinecli.results.files.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
     """

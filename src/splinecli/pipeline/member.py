@@ -6,7 +6,6 @@ fails is kept.
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import traceback
@@ -27,9 +26,9 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
 from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, UnfinishedError, read_report
 from splinecli.results.index import Entry
-from splinecli.system.files import as_input_error
+from splinecli.system.files import NoRoomError, as_splinecli_error
 from splinecli.system.memory import is_out_of_memory
-from splinecli.system.publishing import RefusedFolderError, is_plain
+from splinecli.system.publishing import is_plain
 
 _SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
 
@@ -120,8 +119,6 @@ Redo = Literal["nothing", "changed", "all"]  # of the captures that have results
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -141,7 +138,7 @@ def run_member(
     """Compute one capture of a batch, unless its results are up to date or are to be kept.
 
     `method` returns the estimator; it is called if the capture is computed. Raises UsageError or ModelError as it does:
-    they are wrong for every capture. Raises OutputError if the output folder cannot be written, or the disk is full.
+    they are wrong for every capture. Raises NoRoomError if the disk is full or read-only.
     """
     if member.missing is not None:
         return failed(member.name, member.missing, status="missing")
@@ -166,23 +163,21 @@ def run_member(
 
 
 def _failure(member: Member, error: Exception) -> Outcome:
-    """Return what became of a capture that failed. Raises OutputError again, if other folders would fail, too."""
-    if isinstance(error, OutputError) and not isinstance(error, RefusedFolderError):
-        raise error
+    """Return what became of a capture that failed. Raises NoRoomError, because other folders would fail, too."""
     trace = ""
     if is_out_of_memory(error):
         hint = "Close other programs, or use smaller images"
         error = SplinecliError("there is not enough memory", path=member.folder, hint=hint)
     elif isinstance(error, OSError):
-        if error.errno in _NO_ROOM:
-            raise OutputError(f"cannot be written ({error.strerror})", path=error.filename) from error
-        error = as_input_error(error, member.folder)
+        error = as_splinecli_error(error, member.folder)
     elif not isinstance(error, SplinecliError):
         trace = "".join(traceback.format_exception(error))
         error = SplinecliError(
             f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
             hint="Please report it with the lines above",
         )
+    if isinstance(error, NoRoomError):
+        raise error
     return failed(member.name, error, trace)
 
 
@@ -210,7 +205,7 @@ def find_earlier(
     Raises:
         ChangedError: the results are not those of this capture and these options.
         InputError: the capture cannot be read.
-        RefusedFolderError: both are one folder, which may have files of the user with the names of results.
+        OutputError: both are one folder, which may have files of the user with the names of results.
     """
     try:
         report = read_report(target)
@@ -223,7 +218,7 @@ def find_earlier(
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            raise RefusedFolderError(
+            raise OutputError(
                 f"contains {found}, but no {REPORT}, and is the folder of the capture",
                 path=target,
                 hint="Add --overwrite, or choose another place with -o",

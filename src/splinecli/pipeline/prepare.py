@@ -22,7 +22,7 @@ from splinecli.pixel_sets.entries import (
 )
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.system.files import UNFINISHED, as_input_error, check_writable, write_bytes
+from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
 from splinecli.system.publishing import held_folder
 
 CONTACT_SHEET = "contact_sheet.png"
@@ -75,7 +75,7 @@ def prepare_pixel_set(
                     add_capture(writer, name, folder, as_stored=as_stored, white_level=white_level, update=update)
                     observer.say(writer.describe(name))
                 except (InputError, CaptureChangedError, OSError) as refused:
-                    error = as_input_error(refused, folder) if isinstance(refused, OSError) else refused
+                    error = as_splinecli_error(refused, folder) if isinstance(refused, OSError) else refused
                     observer.error(str(error))
                     skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
                 advance(1)

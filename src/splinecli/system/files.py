@@ -50,6 +50,21 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
     return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
 
+def expanded(path: str) -> Path:
+    """Return the path with ~ replaced by the home folder, unless there is none."""
+    return Path(os.path.expanduser(path))  # noqa: PTH111 - Path.expanduser raises for an unknown user
+
+
+def utf8_name(path: Path, file: IO[bytes]) -> str:
+    """Return the path of an open file for a C library; another name if it is not UTF-8, which some crash on."""
+    name = str(path.absolute())
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return f"/dev/fd/{file.fileno()}"
+    return name
+
+
 def create_hidden(folder: Path) -> IO[bytes]:
     """Return a new hidden file of a random name in the folder, open for writing. Raises OSError."""
     # Mode x neither opens what is there nor follows a link.
@@ -145,20 +160,33 @@ def _whole_number(digits: str) -> int:
     return int(digits)
 
 
+class NoRoomError(OutputError):
+    """The disk is full or read-only. Other folders would fail, too, so a batch ends."""
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
     """Turn an OSError inside the context into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
-        # NumPy tells only how much was written.
+        # NumPy states only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
-        raise OutputError(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
+        kind = NoRoomError if error.errno in (None, *_NO_ROOM) else OutputError
+        raise kind(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
 
 
-def as_input_error(error: OSError, folder: Path) -> InputError:
-    """Return what a system's refusal to read a capture means for the user."""
-    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
+def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
+    """Return what a system's refusal outside of refusals_as_output_errors means: that a file cannot be read.
+
+    `path` is named where the error names none.
+    """
+    if error.errno in _NO_ROOM:
+        return NoRoomError(f"cannot be written ({error.strerror})", path=error.filename or path)
+    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or path)
 
 
 def check_writable(folder: Path) -> None:

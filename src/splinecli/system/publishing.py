@@ -33,11 +33,7 @@ LOCK = ".lock"  # the lock file in a folder that one process at a time may write
 _SECONDS_BETWEEN_TRIES = 0.02
 
 
-class RefusedFolderError(OutputError):
-    """One folder is refused. Others may be fine, so a batch goes on."""
-
-
-class BusyError(RefusedFolderError):
+class BusyError(OutputError):
     """Another process writes into the folder."""
 
 
@@ -45,10 +41,17 @@ class BusyError(RefusedFolderError):
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Make a folder and lock it; `wait` for another process that has locked it, instead of raising BusyError.
 
-    Raises RefusedFolderError if another user left a lock file that this process may not open, or OSError if the folder
+    Raises OutputError if another user left a lock file that this process may not open, or OSError if the folder
     cannot be made or written.
     """
-    file = _locked_file(folder, wait=wait)
+    with locked_file(folder / LOCK, wait=wait):
+        yield
+
+
+@contextmanager
+def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Make a file and its folder, lock the file as `locked` does, and remove it at the end."""
+    file = _locked_file(path, wait=wait)
     try:
         yield
     finally:
@@ -56,37 +59,37 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         if os.name == "nt":
             file.close()
         with suppress(OSError):
-            (folder / LOCK).unlink()
+            path.unlink()
         file.close()
 
 
-def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
-    """Return the open lock file of a folder, which is made as needed."""
+def _locked_file(path: Path, *, wait: bool) -> IO[str]:
+    """Return a lock file, open and locked, which is made as needed."""
     while True:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            file = _open_lock(folder / LOCK)
+            file = _open_lock(path)
         except FileNotFoundError:  # another process removed the folder, because it was empty
             continue
         except PermissionError:
-            if not (folder / LOCK).exists():
+            if not path.exists():
                 raise
-            raise RefusedFolderError(
+            raise OutputError(
                 "this lock file belongs to another user, who may be writing into the folder",
-                path=folder / LOCK,
+                path=path,
                 hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
             ) from None
         try:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
             return file
-        if got and _is_current(file, folder / LOCK):
+        if got and _is_current(file, path):
             return file
         file.close()
         if not got and not wait:
             raise BusyError(
                 "another splinecli process is writing into this folder",
-                path=folder,
+                path=path.parent,
                 hint="Wait for it to end, or choose another -o",
             )
         if not got:
@@ -97,7 +100,7 @@ def _open_lock(path: Path) -> IO[str]:
     """Open a lock file, which is made as needed. Raises OutputError where there is something else, such as a pipe."""
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
-    refused = RefusedFolderError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+    refused = OutputError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
     except (FileNotFoundError, PermissionError):
@@ -145,7 +148,7 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 
 @contextmanager
 def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False) -> Iterator[None]:
-    """Make a folder, lock it, and remove the unfinished files that a killed process left directly in it.
+    """Make a folder, lock it, and remove the unfinished files that killed processes left directly in it.
 
     A folder that was made here and is empty at the end is removed, as are its parents. `warn` receives a sentence about
     what a killed process had left. Raises BusyError if another process has locked the folder, unless it waits for that,
@@ -157,9 +160,13 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
             made = stack.enter_context(made_folder(folder))
             stack.enter_context(locked(folder, wait=wait))
             sync_names(folder, *made)
-            left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
-            for path in left:
-                path.unlink()
+            left = []
+            for path in folder.glob(f".*{UNFINISHED}"):
+                # The probe of another batch that runs is locked, and stays.
+                with suppress(BusyError):
+                    if is_plain(path):
+                        with locked_file(path):
+                            left.append(path)
             if left:
                 warn(f"{folder}: {UNDONE}")
         yield
@@ -235,7 +242,7 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 def refuse_link(folder: Path) -> None:
     """Raise OutputError if a link stands in the place of a folder: it may lead anywhere."""
     if folder.is_symlink():
-        raise RefusedFolderError("found a link, expected a folder", path=folder, hint="Remove it, or choose another -o")
+        raise OutputError("found a link, expected a folder", path=folder, hint="Remove it, or choose another -o")
 
 
 def is_plain(path: Path) -> bool:
@@ -246,12 +253,12 @@ def is_plain(path: Path) -> bool:
 def _check_place(path: Path, folder: Path) -> None:
     """Raise OutputError if no file can be renamed to a path in a folder or in a subfolder of it."""
     if path.is_dir() and not path.is_symlink():
-        raise RefusedFolderError("found a folder, expected a file", path=path)
+        raise OutputError("found a folder, expected a file", path=path)
     if path.parent == folder:
         return
     refuse_link(path.parent)
     if path.parent.exists() and not path.parent.is_dir():
-        raise RefusedFolderError("found a file, expected a folder", path=path.parent)
+        raise OutputError("found a file, expected a folder", path=path.parent)
 
 
 def _remove(path: Path, folder: Path) -> None:

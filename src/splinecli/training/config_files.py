@@ -9,7 +9,7 @@ from typing import Any
 from splinecli.capture.formats.text import read_lines
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.networks.weights import shipped_names
-from splinecli.system.files import parse_json
+from splinecli.system.files import expanded, parse_json
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.defaults import DEFAULT_PRESET
 
@@ -134,7 +134,7 @@ def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
 
 
 def _absolute(path: str) -> str:
-    return str(Path(path).expanduser().absolute())
+    return str(expanded(path).absolute())
 
 
 def _merge(values: Settings, changes: Settings) -> Settings:

@@ -1,5 +1,9 @@
 """Films of an analytic sphere, written by OpenCV: which frames are taken, and what is refused."""
 
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -116,3 +120,38 @@ def test_a_truncated_film_is_refused(tmp_path: Path) -> None:
         film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
         with pytest.raises(InputError, match=message):
             choose_frames(film)
+
+
+def test_a_film_whose_name_is_not_utf8(tmp_path: Path) -> None:
+    """OpenCV crashes on such a name."""
+    film = write_film(tmp_path / "clip.mp4", sphere_film(path_of_lamp(60)), "mp4v")
+    folder = tmp_path / os.fsdecode(b"folder-\xff")
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("the file system has no such names")
+    for other in (folder / "clip.mp4", tmp_path / os.fsdecode(b"clip-\xff.mp4")):
+        shutil.copy(film, other)
+        chosen = choose_frames(other)
+        assert chosen == choose_frames(film)
+        for found, frame in zip(read_frames(other, chosen), read_frames(film, chosen), strict=True):
+            np.testing.assert_array_equal(found, frame)
+
+
+def test_what_ffmpeg_prints_of_a_damaged_film_is_caught(tmp_path: Path) -> None:
+    """Its threads also print between the calls, so a process of its own reads the film, slowly."""
+    rng = np.random.default_rng(2)
+    film = write_film(tmp_path / "clip.avi", sphere_film(path_of_lamp(100)), "XVID")
+    content = bytearray(film.read_bytes())
+    for place in rng.integers(9000, len(content) - 9000, 100):
+        content[place] ^= 0xFF
+    film.write_bytes(content)
+    code = """
+import sys, time
+from pathlib import Path
+from splinecli.capture.formats.film import read_frames
+for _ in read_frames(Path(sys.argv[1]), range(0, 60, 2)):
+    time.sleep(0.01)
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(film)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -5,6 +5,7 @@ Of hundreds of frames, few are needed: sharp ones, not overexposed, whose light 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from splinecli.errors import InputError
 from splinecli.maths.arrays import Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
+from splinecli.system.files import utf8_name
 
 if TYPE_CHECKING:
     import cv2
@@ -87,9 +89,10 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
             with native_stderr():  # not longer, because it stops progress bars, too
                 while place <= number and video.grab():
                     place += 1
-            if place <= number:
-                raise ValueError
-            yield np.ascontiguousarray(_picture(video)[..., ::-1])
+                if place <= number:
+                    raise ValueError
+                picture = np.ascontiguousarray(_picture(video)[..., ::-1])
+            yield picture
 
 
 def _candidates(film: Path) -> list[_Candidate]:
@@ -153,13 +156,16 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
 
     check_file(film, "a film")
     problem = "the film is damaged, or in a form that cannot be read"
-    with damage_as_input_error(film, problem, "Copy it again, or convert it to MP4 with H.264"):
-        with film.open("rb") as file:
-            start = file.read(16)
+    hint = "Copy it again, or convert it to MP4 with H.264"
+    with damage_as_input_error(film, problem, hint), film.open("rb") as file:
+        start = file.read(16)
         if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
             raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+        file.seek(0)
+        # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
         with native_stderr():
-            video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
+            video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
         try:
             if not video.isOpened():
                 raise ValueError
@@ -167,7 +173,8 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
             check_stored_size(size, 1, film)
             yield video
         finally:
-            video.release()
+            with native_stderr():
+                video.release()
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:

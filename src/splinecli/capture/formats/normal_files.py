@@ -30,6 +30,7 @@ from splinecli.errors import InputError
 from splinecli.maths.arrays import Array, Bools, Doubles, Singles
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
 from splinecli.system.extras import import_extra
+from splinecli.system.files import utf8_name
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")  # of a depth
 _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff")
@@ -226,13 +227,15 @@ def read_depth(path: Path, expected: ExpectedSize) -> Doubles:
 def _read_exr(path: Path, expected: ExpectedSize) -> Array:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
-    with native_stderr():
-        low, high = library.File(str(path), header_only=True).header()["dataWindow"]
-    shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
-    check_stored_size(shape, 4, path, expected)
-    # Of damaged pixels, the library only prints a warning; stdout belongs to the product of a command.
-    with redirect_stdout(io.StringIO()) as printed, native_stderr():
-        channels = library.File(str(path)).channels()
+    with path.open("rb") as file:
+        name = utf8_name(path, file)
+        with native_stderr():
+            low, high = library.File(name, header_only=True).header()["dataWindow"]
+        shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
+        check_stored_size(shape, 4, path, expected)
+        # Of damaged pixels, the library only prints a warning; stdout belongs to the product of a command.
+        with redirect_stdout(io.StringIO()) as printed, native_stderr():
+            channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path=path)
     for name in (*_EXR_CHANNELS, *channels):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.damage import native_stderr
 from splinecli.errors import InputError
 from splinecli.system.extras import import_extra
+from splinecli.system.files import utf8_name
 
 if TYPE_CHECKING:
     import rawpy
@@ -28,7 +29,7 @@ RAW_SUFFIXES = (
 
 def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
     """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
-    with _libraw(path) as rawpy, native_stderr(), rawpy.imread(str(path)) as raw:
+    with _libraw(path) as rawpy, path.open("rb") as file, native_stderr(), rawpy.imread(utf8_name(path, file)) as raw:
         return (raw.sizes.height, raw.sizes.width, 3), 2
 
 
