@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 from splinecli import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
+from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT
 from splinecli.capture.paths import find_mode, resolve
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, method_names
@@ -25,7 +26,7 @@ from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, UnfinishedError, read_report
+from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.index import Entry
 from splinecli.system.files import as_input_error
 from splinecli.system.memory import is_out_of_memory

@@ -24,7 +24,7 @@ _TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
-"""The classes of numeric arrays. MATLAB stores numbers in the smallest type that has them: a double may lie as bytes."""
+"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that has them: a double may lie as bytes."""
 _COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
