@@ -53,9 +53,14 @@ class RadiometricCalibration:
                 text += " Add --transfer linear if their values are linear."
                 warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
             return replace(self, curve=curve), warnings
-        if by:
+        if by and self.automatic:
             text = f"The images look display-encoded ({by}) but are read as linear."
             warnings.append(CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB."))
+        elif by:
+            text = f"The images say that they are display-encoded ({by}), but are read as linear, as --transfer says."
+            warnings.append(
+                CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Leave it out if their values are not linear.")
+            )
         return self, warnings
 
 

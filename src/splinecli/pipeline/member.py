@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 from splinecli import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT
+from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.capture.paths import find_mode, resolve
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, method_names
@@ -193,6 +193,10 @@ def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status 
     return Outcome(status, document, error.exit_code, trace)
 
 
+_OPTIONS = {"formats": "format", **dict.fromkeys((f"{name}_scale" for name in SCALED_MAPS), "maps")}
+"""The options of `infer` whose fields in InferOptions have other names."""
+
+
 class ChangedError(OutputError):
     """A folder has results of other input files, other options or another version."""
 
@@ -236,11 +240,12 @@ def find_earlier(
     if version != __version__:
         raise ChangedError(f"by version {version}", target)
     if earlier != options:
-        names = [
-            "--" + option.name.replace("formats", "format").replace("_", "-")
+        changed = [
+            option.name
             for option in fields(options)
             if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
         ]
+        names = list(dict.fromkeys(f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in changed))
         differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
         raise ChangedError(f"with {differences}", target)
     if stamp != inputs_sha256(options.open(folder), options.weights):
