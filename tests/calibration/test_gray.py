@@ -62,6 +62,7 @@ def test_images_and_masks_of_another_size(tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "1.png"), np.full((20, 31), 30_000, np.uint16))
     with pytest.raises(InputError, match=r"1\.png: found an image of 31 x 20 pixels, expected 30 x 20 as in 0\.png"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
+    cv2.imwrite(str(folder / "1.png"), np.full((20, 30), 30_000, np.uint16))
     cv2.imwrite(str(folder / "mask.png"), np.full((10, 30), 255, np.uint8))
     with pytest.raises(InputError, match=r"mask\.png: found a mask of 30 x 10 pixels, expected 30 x 20 as in 0\.png"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")

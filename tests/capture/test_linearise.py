@@ -85,6 +85,21 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
     np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
 
 
+def test_some_pixels_are_as_among_all(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    """Under ambient light, with a flat field for all images and one for each."""
+    rng = np.random.default_rng(3)
+    folder, wanted = store(tmp_path / "capture", light), np.array([3, 40, 41, 98])
+    ambient = write(tmp_path / "ambient.png", rng.uniform(0, 0.05, light.shape[1:]))
+    flats = tuple(write(tmp_path / f"flat/{n}.png", rng.uniform(0.3, 0.6, light.shape[1:])) for n in range(4))
+    for flat_field in (flats, flats[:1]):
+        source = open_capture(folder, radiometry=RadiometricCalibration(ambient=ambient, flat_field=flat_field))
+        every = list(source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels))
+        some = source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels, wanted=wanted)
+        for whole, part in zip(every, some, strict=True):
+            np.testing.assert_array_equal(part.linear, whole.linear[wanted])
+            np.testing.assert_array_equal(part.values, whole.values)
+
+
 def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> None:
     folder = store(tmp_path / "capture", light)
     small, black = write(tmp_path / "small.png", light[0, :5]), write(tmp_path / "black.png", 0 * light[0])

@@ -5,7 +5,7 @@ import pytest
 
 from scenes import directions_at
 from splinecli.capture.arrays import capture_from_arrays
-from splinecli.capture.sample import Sample, leave_out_background
+from splinecli.capture.sample import CLOSEUP_SIDE, Sample, closeup_of, leave_out_background
 from splinecli.diagnosis.checks import check_arrays
 
 
@@ -18,6 +18,15 @@ def ball_before(background: float, size: int = 80) -> tuple[np.ndarray, np.ndarr
     images = np.random.default_rng(0).uniform(0, 2 * background, (12, size, size))
     images[:, mask] = 0.8 * np.maximum(normals[mask] @ lights.T, 0).T
     return images, lights, mask
+
+
+def test_a_closeup_is_around_the_median_pixel_of_the_mask():
+    rng = np.random.default_rng(0)
+    for share in (0.001, 0.3, 1.0):
+        mask = rng.uniform(size=(700, 900)) < share * np.linspace(0, 1, 900)
+        for part, places in zip(closeup_of(mask), np.nonzero(mask), strict=True):
+            assert part.stop - part.start == CLOSEUP_SIDE
+            assert abs(part.start + CLOSEUP_SIDE // 2 - np.median(places)) <= 1  # of an even number, the lower middle
 
 
 def test_a_dark_background_is_left_out():

@@ -16,8 +16,19 @@ import pytest
 import tifffile
 
 from cli.conftest import EXAMPLE, read_report
+from splinecli.capture.layouts.capture_files import IMAGE_SUFFIXES
+from splinecli.capture.layouts.result_names import (
+    CONFIDENCE_PICTURE,
+    ERROR_MAP,
+    FOUND_MASK,
+    LIGHT_PLOT,
+    MAPS,
+    NORMALS,
+    PLOTS,
+)
 from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.least_squares import LeastSquares
+from splinecli.surface.surface_files import SURFACE_FILES
 
 
 def test_writes_the_contract(capture, truth, run, golden):
@@ -313,3 +324,21 @@ def test_each_image_is_opened_at_most_three_times(run, tmp_path):
         counting.clear()
     counts = sorted(opened[path] for path in EXAMPLE.glob("[0-9]*.png"))
     assert counts == 5 * [1] + 5 * [3]
+
+
+def test_no_result_beside_the_images_counts_as_one_of_them(run, capture):
+    """With every file that infer and integrate write, and the pictures of the other commands."""
+    formats = [name for name in NORMALS if name != "exr"]
+    arguments = ["infer", capture, "--method", "ls", "-o", ".", "--surface", "--html", "--json"]
+    maps = ",".join(name for name in MAPS if name != "confidence")  # not of this method
+    [first] = json.loads(run(*arguments, "--maps", maps, "--format", ",".join(formats)).out)
+    surface = [name for name in SURFACE_FILES if name != "exr"]
+    assert run("integrate", capture, "--format", ",".join(surface), "--overwrite").code == 0
+    for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, CONFIDENCE_PICTURE, FOUND_MASK):
+        if not (capture / name).exists():
+            cv2.imwrite(str(capture / name), np.zeros((24, 24), np.uint8))
+    pictures = {path.name for path in capture.glob("*") if path.suffix in IMAGE_SUFFIXES} - {"mask.png"}
+    assert len(pictures) > 8 + 20
+    assert json.loads(run("info", capture, "--json").out)["images"] == 8
+    [again] = json.loads(run(*arguments, "--overwrite").out)
+    assert again["n_lights"] == first["n_lights"] == 8

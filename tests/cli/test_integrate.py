@@ -122,11 +122,25 @@ def test_a_prior(run, form):
     np.testing.assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
 
 
+def with_one(value: float, *, few: bool = False) -> np.ndarray:
+    """Return the heights, or only a few of them, with another value in one pixel."""
+    heights = sphere()[1]
+    if few:
+        heights[np.arange(heights.size).reshape(SHAPE) % 97 > 0] = np.nan
+    heights[9, 20] = value
+    return heights
+
+
 BAD_PRIORS = {
     "size": (np.ones((3, 4), np.float32), "found a depth map of 4 x 3 pixels"),
     "integers": (np.ones(SHAPE, np.uint16), "expected floating-point numbers"),
     "vectors": (np.ones((*SHAPE, 2), np.float32), "expected floating-point numbers"),
     "nothing": (np.full(SHAPE, np.nan, np.float32), "the prior has no value in the mask"),
+    "all far too large": (np.full(SHAPE, 1e60), "values of the prior are beyond 1e+07, the first in row"),
+    "larger than squares": (sphere()[1] * 1e200, "values of the prior are beyond 1e+07"),
+    "one of 1e60": (with_one(1e60), "values of the prior are beyond 1e+07, the first in row 9, column 20."),
+    "one of 1e6": (with_one(1e6), "than 3 times the width of the object, the first in row 9, column 20."),
+    "one among few": (with_one(1e6, few=True), "than 3 times the width of the object, the first in row 9, column 20."),
     "negated": (-sphere()[1].astype(np.float32), "the slopes of the prior are -"),
 }
 
@@ -182,6 +196,20 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
         one, other = (trimesh.load(place / name, force="mesh", process=False) for place in places)
         np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)
         np.testing.assert_array_equal(one.faces, other.faces)
+
+
+@pytest.mark.parametrize("size", ["option", "file", "width"])
+def test_the_unit_of_lamps_is_not_that_of_the_surface(run, size):
+    """Lamps in a unit in which pixels are smaller than any in millimetres."""
+    folder = write_bump(Path("bump"))
+    np.savetxt("lamps.txt", 1e-9 * BUMP_LAMPS)
+    if size == "file":
+        Path("bump/pixel_size.txt").write_text("2e-9")
+    options = {"option": ["--pixel-size", "2e-9"], "file": [], "width": ["--object-width", "64e-9"]}[size]
+    result = run("infer", folder, "--method", "ls", *options, "--light-positions", "lamps.txt")
+    assert result.code == 0, result.err
+    report = json.loads(run("integrate", "out/bump", "--format", "npy", "--json").out)
+    assert (report["unit"], report["pixel_size_mm"]) == ("pixel", None)
 
 
 def test_a_part_in_colour_by_perspective(run):
@@ -291,7 +319,7 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     ],
 )
 def test_a_damaged_report_is_named(run, capture, where, key, value):
-    assert run("infer", capture, "--method", "ls", "--format", "npy").code == 0
+    assert run("infer", capture, "--method", "ls", "--format", "npy", "--surface").code == 0
     path = Path("out", capture, "report.json")
     report = json.loads(path.read_text())
     (report[where] if where else report)[key] = value

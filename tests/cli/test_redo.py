@@ -2,12 +2,15 @@
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from cli.conftest import read_report
+from cli.conftest import COMMAND, read_report
+from splinecli.cli.main import app
 from splinecli.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
@@ -52,6 +55,17 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
 def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
     path.write_text(path.read_text().replace(old, new, 1))
     return ()
+
+
+def test_what_changed_is_named_by_options_that_exist(capture, run, monkeypatch):
+    """Here all of them: no option is as in the report."""
+    assert run("infer", capture, "--method", "ls", "--maps", "relief,curvature").code == 0
+    other = run("infer", capture, "--method", "ls", "--maps", "relief:3,curvature:0.2")
+    assert (other.code, "made with another --maps. Add --update" in other.err) == (5, True)
+    monkeypatch.setattr(InferOptions, "from_dict", lambda values: SimpleNamespace(**dict.fromkeys(values, "another")))
+    named = set(re.findall(r"--[a-z-]+", run("infer", capture, "--method", "ls").err.split(")")[0]))
+    known = {name for parameter in COMMAND(app).commands["infer"].params for name in parameter.opts}
+    assert len(named) > 20 and named <= known
 
 
 CHANGES = {

@@ -102,6 +102,15 @@ def test_mended_lights(run, medallion):
     np.testing.assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
     assert run("info", medallion, "--mended-lights", "mended.txt").code == 5
     assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
+    for name in ("mended.lp", "mended.npy"):
+        assert run("info", medallion, "--mended-lights", name).code == 0
+        again = run("infer", medallion, "--lights", name, "--method", "ls", "--strict", "-o", name[-3:])
+        assert (again.code, again.err) == (0, "")
+        np.testing.assert_allclose(read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5)
+    for suffix in ("json", "mat", "yml", "xml"):
+        refused = run("info", medallion, "--mended-lights", f"mended.{suffix}")
+        assert (refused.code, f"of the type .{suffix} are only read. Write .txt" in refused.err) == (2, True)
+        assert not Path(f"mended.{suffix}").exists()
 
 
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):

@@ -1,5 +1,6 @@
 """Meshes as files give them, and as rendering needs them."""
 
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,14 @@ def test_a_ball_inside_out_is_turned(tmp_path: Path) -> None:
     ball.invert()
     ball.export(tmp_path / "inverted.ply")
     assert outward_volume(read_mesh(tmp_path / "inverted.ply")) > 0
+
+
+def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path: Path) -> None:
+    (tmp_path / "blank.obj").write_text("\n" * 2_000_000)
+    started = time.process_time()
+    with pytest.raises(InputError):
+        read_mesh(tmp_path / "blank.obj")
+    assert time.process_time() - started < 3  # the square took an hour
 
 
 def test_splitting_edges_changes_neither_surface_nor_shading() -> None:

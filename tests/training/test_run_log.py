@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from scenes import decode_rgb
+from splinecli.capture.layouts.result_names import CURVES, TRAINING_MAPS
 from splinecli.training.config import TrainingConfig
-from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
+from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.loop import Trainer
 from splinecli.training.run_log import Metrics, RunLog, read_metrics
 
@@ -59,10 +60,10 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) 
 def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
     assert {path.name for path in tmp_path.iterdir()} == {
-        "checkpoint.safetensors", "config.json", CURVES, MAPS, METRICS, "weights.safetensors",
+        "checkpoint.safetensors", "config.json", CURVES, TRAINING_MAPS, METRICS, "weights.safetensors",
     }  # fmt: skip
     assert decode_rgb((tmp_path / CURVES).read_bytes()).std() > 5
-    assert decode_rgb((tmp_path / MAPS).read_bytes()).std() > 20
+    assert decode_rgb((tmp_path / TRAINING_MAPS).read_bytes()).std() > 20
 
 
 def test_tensorboard_s_events(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
 from splinecli.capture.formats.exif import check_exposures
-from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.image_size import ExpectedSize, common_size
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
@@ -48,7 +48,7 @@ def measure_light_intensities(
     if len(files.images) != n_lights:
         problem = f"found {len(files.images)} images, expected {n_lights}, one for each light"
         raise InputError(problem, path=files.folder)
-    mask, normals = _target_normals(files, files.facts[0].size[0][:2], target)
+    mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
     capture = CaptureSource(
         CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
@@ -59,9 +59,9 @@ def measure_light_intensities(
     )
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
     values, found = [], []
-    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels):
+    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels, wanted=rows):
         found.append(image.find_saturated(None))
-        values.append(image.linear[rows].astype(np.float64))
+        values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
     intensities = np.empty((n_lights, 3))

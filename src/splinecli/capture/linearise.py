@@ -17,7 +17,7 @@ from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
 from splinecli.capture.window import Window
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Doubles, Singles
+from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
 BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
@@ -53,14 +53,21 @@ class RadiometricCalibration:
                 text += " Add --transfer linear if their values are linear."
                 warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
             return replace(self, curve=curve), warnings
-        if by:
+        if by and self.automatic:
             text = f"The images look display-encoded ({by}) but are read as linear."
             warnings.append(CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB."))
+        elif by:
+            text = f"The images say that they are display-encoded ({by}), but are read as linear, as --transfer says."
+            warnings.append(
+                CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Leave it out if their values are not linear.")
+            )
         return self, warnings
 
 
 AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images say otherwise
 AS_STORED = RadiometricCalibration()  # stored values are linear light
+
+EVERY_PIXEL = slice(None)
 
 
 _MIDDLE_OF_8_BITS = np.float32(0.25 / 255)
@@ -85,9 +92,16 @@ def take_pixels(image: Array, mask: Bools) -> Array:
 
 
 def pixel_reader(
-    radiometry: RadiometricCalibration, mask: Bools, n_images: int, like: str, window: Window
+    radiometry: RadiometricCalibration,
+    mask: Bools,
+    n_images: int,
+    like: str,
+    window: Window,
+    wanted: Integers | slice = EVERY_PIXEL,
 ) -> Callable[[Path, int], tuple[Array, Singles]]:
     """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
+
+    Of linear light, it returns the `wanted` pixels alone.
 
     The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
     image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
@@ -98,12 +112,14 @@ def pixel_reader(
         problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
         raise InputError(problem, path=flats[0].parent)
 
-    def pixels(path: Path, like: str = "the other images") -> tuple[Array, Singles]:
+    def pixels(
+        path: Path, like: str = "the other images", wanted: Integers | slice = EVERY_PIXEL
+    ) -> tuple[Array, Singles]:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         stored = take_pixels(window.of(image), mask)
-        linear = linear_light(stored, path, radiometry.curve)
-        return stored, linear if ambient is None else np.maximum(linear - ambient, 0)
+        linear = linear_light(stored[wanted], path, radiometry.curve)
+        return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
 
     def falloff(path: Path) -> Singles:
         _, linear = pixels(path)
@@ -117,9 +133,9 @@ def pixel_reader(
     common = falloff(flats[0]) if len(flats) == 1 else None
 
     def read(path: Path, index: int) -> tuple[Array, Singles]:
-        stored, linear = pixels(path, like)
+        stored, linear = pixels(path, like, wanted)
         flat = falloff(flats[index]) if len(flats) > 1 else common
-        return stored, linear if flat is None else linear / flat
+        return stored, linear if flat is None else linear / flat[wanted]
 
     return read
 
@@ -130,7 +146,7 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    linear: Singles  # (P, C) float32, linear light
+    linear: Singles  # (P, C) float32, linear light; or (p, C) of the pixels that were wanted
     intensity: Doubles  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states; None where it states none
 

@@ -12,7 +12,7 @@ import numpy as np
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.damage import stderr_is_apart
 from splinecli.capture.formats.facts import ImageFacts
-from splinecli.capture.formats.image_size import ExpectedSize, check_capture, common_size
+from splinecli.capture.formats.image_size import ExpectedSize, check_capture, check_stored_size, common_size
 from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
@@ -23,6 +23,7 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import (
     AS_STORED,
+    EVERY_PIXEL,
     RadiometricCalibration,
     StoredPixels,
     collect_observations,
@@ -33,7 +34,7 @@ from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Doubles
+from splinecli.maths.arrays import Bools, Doubles, Integers
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -138,11 +139,12 @@ class CaptureSource:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
-        """Return the mask (H, W) of what is read of images of this shape. Raises InputError."""
+        """Return the mask (H, W) of what is read of images of this shape. Raises InputError, also for a huge shape."""
         if self.automatic_mask is not None:
             return self.automatic_mask
-        files, mask = self.files, np.ones(shape, np.bool_)
-        expected = ExpectedSize(shape, files.images[0].name, "a mask")
+        files = self.files
+        check_stored_size(shape, 1, files.images[0])
+        mask, expected = np.ones(shape, np.bool_), ExpectedSize(shape, files.images[0].name, "a mask")
         if files.boundaries:  # of CyclesPS
             mask = np.any([decode_image(path, expected).max(axis=2) > 0 for path in files.boundaries], axis=0)
             if not mask.any():
@@ -187,13 +189,15 @@ class CaptureSource:
         indices: Sequence[int],
         use: Callable[[StoredPixels], Item],
         progress: Progress = lambda: None,
+        wanted: Integers | slice = EVERY_PIXEL,
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
-        Raises InputError where an image cannot be read, or does not have the size of the mask.
+        Of these pixels (P,), the stored values are complete, and the linear ones are those that are `wanted`. Raises
+        InputError where an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
-        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window)
+        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted)
 
         def read(index: int) -> Item:
             facts, intensity = self.facts[index], self.light_intensities[index]

@@ -11,12 +11,12 @@ from typer import Argument, Option
 
 from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.capture.formats.text import to_number
+from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.failures import printed_documents
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
-from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.results.index import HEADER, INDEX, Entry, Row
 
 if TYPE_CHECKING:
@@ -36,7 +36,10 @@ def infer(
     light_positions: Path | None = shared.LIGHT_POSITIONS,
     light_distance: float | None = shared.LIGHT_DISTANCE,
     pixel_size: float | None = Option(
-        None, metavar="S", help=f"{shared.PIXEL_SIZE} With --surface: in millimetres, for a surface in millimetres."
+        None,
+        metavar="S",
+        help=f"{shared.PIXEL_SIZE} With --surface: in millimetres, as the lamps then are, for a"
+        " surface in millimetres.",
     ),
     object_width: float | None = shared.OBJECT_WIDTH,
     camera_matrix: Path | None = shared.CAMERA_MATRIX,

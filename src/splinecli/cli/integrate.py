@@ -59,7 +59,7 @@ def integrate(
         None,
         metavar="MM",
         help="Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres."
-        " [default: as in report.json beside the normal map, or in pixels]",
+        " [default: that of infer --surface, by report.json beside the normal map, or in pixels]",
     ),
     output: Path | None = Option(
         None, "--output", "-o", metavar="OUT", help="Folder of the results. [default: that of NORMALS]"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
+from splinecli.capture.layouts.result_names import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.errors import printable
 from splinecli.evaluation.capture_figures import CaptureFigure
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
@@ -26,7 +27,6 @@ _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
-LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
 
 
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
@@ -35,7 +35,7 @@ def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
         return plots
     if len({evaluation.protocol.n_lights for evaluation in evaluations}) > 1:
-        plots[LIGHTS_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
+        plots[LIGHT_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
     if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
         plots[LIGHT_NOISE_PLOT] = ("Error against the light noise.", light_noise_curves(evaluations))
     return plots
@@ -57,7 +57,7 @@ def write_results(
         REPORT: html_report(evaluations, shown, document["notes"]),
         RESULTS: json.dumps(document, indent=2) + "\n",
     }
-    stale = [LIGHTS_PLOT, LIGHT_NOISE_PLOT]
+    stale = [LIGHT_PLOT, LIGHT_NOISE_PLOT]
     if figures is not None:
         stale += [f"{FIGURES}/{path.name}" for path in (output / FIGURES).glob("*.png")]
     with new_files(output, report=RESULTS, stale=stale) as new:

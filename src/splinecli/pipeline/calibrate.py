@@ -11,6 +11,7 @@ from splinecli.calibration.circle import Circle
 from splinecli.calibration.gray import measure_light_intensities
 from splinecli.calibration.lamp_positions import triangulate_lamps
 from splinecli.calibration.report import calibration_report, summary_lines
+from splinecli.capture.layouts.result_names import CALIBRATION
 from splinecli.capture.lights.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
@@ -23,7 +24,7 @@ from splinecli.system.publishing import held_folder, new_files
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
-PICTURE, REPORT = "calibration.png", "calibration.json"
+PICTURE, REPORT = CALIBRATION, "calibration.json"
 OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
 
 

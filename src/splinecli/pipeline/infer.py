@@ -11,6 +11,7 @@ import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
 from splinecli.capture.formats.image_size import check_memory, results_bytes
+from splinecli.capture.layouts.result_names import FOUND_MASK, LIGHT_FILES, PAGE
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stamp import digest
@@ -155,7 +156,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 def _check_light_files(target: Path) -> None:
     """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
     own = files.own_light_files(target)
-    for name in files.LIGHT_FILES:
+    for name in LIGHT_FILES:
         if (target / name).exists() and name not in own:
             raise OutputError(
                 "the file is not from an earlier run, and --lights estimate would overwrite it",
@@ -194,7 +195,7 @@ def _make_files(
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
         found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
-        found.append([(files.FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
+        found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
         clock.begin("surface")
         camera_matrix, pixel_size = view_of_report(report)
@@ -221,5 +222,5 @@ def _make_files(
             error_map_deg=estimate.error_map_deg,
             light_plot=light_plot,
         )
-        found.append([(files.PAGE, page)])
+        found.append([(PAGE, page)])
     return found

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.layouts.capture_files import check_not_empty, list_images
+from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.capture.lights.draws import check_draw_settings
 from splinecli.capture.lights.found_lights import ESTIMATE, FirstLight, LightFinder
 from splinecli.capture.lights.lamp_files import LampOptions
@@ -27,7 +28,6 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
 from splinecli.pipeline.surface import check_pixel_size
-from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.system.devices import Device, Precision
 from splinecli.system.exr import check_exr
@@ -160,7 +160,7 @@ class InferOptions(Reading):
     Args:
         n_lights: None for all. light_indices: counted from 0.
         distil: False for the method on every pixel, None for distillation of large captures only.
-        formats, maps: names of `splinecli.results.files.NORMALS` and MAPS.
+        formats, maps: names of `splinecli.capture.layouts.result_names.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from splinecli.capture.capture_warnings import estimated_lights
 from splinecli.capture.lights.found_lights import FoundLights
-from splinecli.capture.lights.light_files import rows_text
+from splinecli.capture.lights.named_lights import check_writable, encode_lights
 from splinecli.capture.summary import CaptureSummary, summarise_capture
 from splinecli.diagnosis.checks import check_evidence
 from splinecli.diagnosis.evidence import Evidence
@@ -75,6 +75,7 @@ def describe_capture(
                 )
             check_free(plot.parent, [plot.name], overwrite=overwrite)
         if mended_lights is not None:
+            check_writable(mended_lights)
             if source.lamps is not None and source.lamps.used:
                 raise UsageError("--mended-lights writes directions, but the lights are near lamps")
             check_free(mended_lights.parent, [mended_lights.name], overwrite=overwrite)
@@ -82,6 +83,8 @@ def describe_capture(
             summary = summarise_capture(source, progress=lambda: advance(1))
         summary, found_lights = _with_found_lights(summary)
         source = summary.source
+        if plot is not None and source.find_lights is not None and found_lights is None:
+            raise InputError("the images differ in size, so there are no lights to plot", path=source.files.folder)
         if plot is not None:
             errors_deg = None if found_lights is None else found_lights.errors_deg
             write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
@@ -102,7 +105,7 @@ def describe_capture(
         if mended_lights is not None:
             mended = None if check is None or check.odd_image is not None else check.mended
             if mended is not None:
-                write_bytes(mended_lights, rows_text(mended).encode())
+                write_bytes(mended_lights, encode_lights(mended_lights, mended, source.files.images))
             report["mended_lights"] = None if mended is None else str(mended_lights)
         if check_lights:
             report["light_candidates"] = [] if check is None else candidate_rows(check)
@@ -117,11 +120,12 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         f" {types.get(kind['type'], kind['type'])}"
         for kind in report["image_kinds"]
     )
-    nearest, farthest = report["axis_angle_deg"]
     estimated = report["estimated_lights"]
-    lights = report["light_directions"] or "estimated from the images"
-    if report["light_directions"] is None and estimated is None:
-        lights = "not estimated, because the images differ in size"
+    lights = "not estimated, because the images differ in size"
+    if report["axis_angle_deg"] is not None:
+        nearest, farthest = report["axis_angle_deg"]
+        lights = report["light_directions"] or "estimated from the images"
+        lights += f", {nearest:.0f} to {farthest:.0f} degrees from the camera axis"
     intensities = report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
     if estimated is not None and estimated["intensities"] is not None:
         intensities = "estimated from the images"
@@ -130,7 +134,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     rows = [
         ("capture", f"{report['capture']} ({report['layout']})"),
         ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
-        ("lights", f"{lights}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
+        ("lights", lights),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
         ("intensities", intensities),
         *([("reads", report["reads"])] if report["reads"] else []),
@@ -213,7 +217,9 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "light_intensities": None if intensities is None else str(intensities),
         "mask": None if files.mask is None else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
-        "axis_angle_deg": [round(float(angles.min()), 1), round(float(angles.max()), 1)],
+        "axis_angle_deg": None
+        if source.find_lights is not None and found is None
+        else [round(float(angles.min()), 1), round(float(angles.max()), 1)],
         "white_level": None if level is None else {"value": level.value, "origin": level.origin},
         "exposure": {
             "bright": [round(min(bright), 4), round(max(bright), 4)],

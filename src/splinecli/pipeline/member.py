@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 from splinecli import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
+from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.capture.paths import find_mode, resolve
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, method_names
@@ -24,7 +25,7 @@ from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, UnfinishedError, read_report
+from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.index import Entry
 from splinecli.system.files import NoRoomError, as_splinecli_error
 from splinecli.system.memory import is_out_of_memory
@@ -187,6 +188,10 @@ def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status 
     return Outcome(status, document, error.exit_code, trace)
 
 
+_OPTIONS = {"formats": "format", **dict.fromkeys((f"{name}_scale" for name in SCALED_MAPS), "maps")}
+"""The options of `infer` whose fields in InferOptions have other names."""
+
+
 class ChangedError(OutputError):
     """A folder has results of other input files, other options or another version."""
 
@@ -230,11 +235,12 @@ def find_earlier(
     if version != __version__:
         raise ChangedError(f"by version {version}", target)
     if earlier != options:
-        names = [
-            "--" + option.name.replace("formats", "format").replace("_", "-")
+        changed = [
+            option.name
             for option in fields(options)
             if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
         ]
+        names = list(dict.fromkeys(f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in changed))
         differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
         raise ChangedError(f"with {differences}", target)
     if stamp != inputs_sha256(options.open(folder), options.weights):

@@ -6,6 +6,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from splinecli.capture.layouts.result_names import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
@@ -24,8 +25,6 @@ from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
 from splinecli.system.publishing import held_folder
-
-CONTACT_SHEET = "contact_sheet.png"
 
 
 def prepare_pixel_set(

@@ -83,7 +83,8 @@ def view_of_report(
     matrix = None if camera_matrix is None else window.camera(camera_matrix)
     if matrix is None and lamps is not None and lamps["camera"] == "perspective":
         matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)  # of what the window reads
-    if pixel_size_mm is None and options["pixel_size"] is not None:
+    # Without a surface, it only scaled near lamps, whose unit may be any.
+    if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
     check_pixel_size(pixel_size_mm)
     return matrix, None if pixel_size_mm is None else pixel_size_mm * window.step

@@ -1,4 +1,4 @@
-"""The files that `infer` writes for a capture: their names, and functions that write them, all or none."""
+"""The files that `infer` writes for a capture: functions that encode them, and write all or none."""
 
 from __future__ import annotations
 
@@ -12,6 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.capture.layouts.result_names import (
+    ALBEDO,
+    ALBEDO_EXR,
+    ALBEDO_PICTURE,
+    CONFIDENCE,
+    CONFIDENCE_PICTURE,
+    CURVATURE,
+    CURVATURE_PICTURE,
+    CURVATURE_TIFF,
+    ERROR_MAP,
+    FOUND_MASK,
+    GRADIENT,
+    GRADIENT_TIFF,
+    LIGHT_DIRECTIONS,
+    LIGHT_FILES,
+    LIGHT_INTENSITIES,
+    LIGHT_PLOT,
+    NORMALS,
+    OWN_FILES,
+    PREVIEW,
+    RELIEF,
+    RELIEF_PICTURE,
+    RELIEF_TIFF,
+    REPORT,
+)
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
@@ -31,53 +56,6 @@ from splinecli.system.publishing import Content, is_plain, new_files
 if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
     from splinecli.results.report import Clock
-
-NORMALS = {
-    "png": "normals.png",
-    "png8": "normals_8bit.png",
-    "npy": "normals.npy",
-    "tiff": "normals.tiff",
-    "exr": "normals.exr",
-}
-"""The file of the normal map in each format."""
-
-ERROR_MAP = "error_map.png"
-REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
-CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
-LIGHT_FILES = LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
-    "light_directions.txt",
-    "light_intensities.txt",
-    "lights.png",
-)
-"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
-
-GRADIENT, GRADIENT_TIFF = "gradient.npy", "gradient.tiff"
-CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF = "curvature.png", "curvature.npy", "curvature.tiff"
-RELIEF_PICTURE, RELIEF, RELIEF_TIFF = "relief.png", "relief.npy", "relief.tiff"
-MAPS = {
-    "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
-    "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
-    "preview": (PREVIEW,),
-    "gradient": (GRADIENT, GRADIENT_TIFF),
-    "curvature": (CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF),
-    "relief": (RELIEF_PICTURE, RELIEF, RELIEF_TIFF),
-}
-"""The files of each optional map."""
-
-SCALED_MAPS = ("curvature", "relief")  # maps whose picture has a fixed scale, which the user may choose
-OWN_FILES = (
-    *NORMALS.values(),
-    ERROR_MAP,
-    *(name for names in MAPS.values() for name in names),
-    *file_names(tuple(SURFACE_FILES)),
-    SURFACE_REPORT,
-    FOUND_MASK,
-    PAGE,
-    REPORT,
-)
-"""All files that `infer` and `integrate` may write into a capture's folder of results, but LIGHT_FILES."""
-
 
 Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
 

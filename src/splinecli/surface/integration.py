@@ -33,6 +33,8 @@ _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the few
 _PRIOR_DETAIL = 0.15  # of the root of the mask's area
 _CORRELATED = 0.3  # slopes of prior and normals
 _LEAST_STEEP, _MOST_STEEP = 0.2, 5.0  # times the normals' slopes; a blurred prior is flatter
+_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; float32 keeps no more than whole numbers above
+_FARTHEST = 3.0  # from the median height to any other, in the larger of the mask's width and height
 _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
 RELIEF_WIDTH = 64.0
@@ -188,7 +190,9 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
     if prior.shape != mask.shape:
         raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape}, that of the normal map")
     heights = prior[mask].astype(np.float64)
+    _refuse(np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE), mask, f"beyond {_LARGEST_VALUE:g}")
     if camera_matrix is not None:
+        _refuse((heights > 0) & (heights < 1 / _LARGEST_VALUE), mask, f"below {1 / _LARGEST_VALUE:g}")
         heights = -focal_length(camera_matrix) * np.log(np.where(heights > 0, heights, np.nan))
     heights[~np.isfinite(heights)] = np.nan
     if np.isnan(heights).all():
@@ -196,8 +200,17 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
     return heights
 
 
+def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
+    """Raise InputError where some values (P,) of a prior over a mask (H, W) are wrong; `what` says in which way."""
+    if wrong.any():
+        row, column = divmod(int(np.flatnonzero(mask)[wrong.argmax()]), mask.shape[1])
+        problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}, the first in row {row}"
+        hint = "Give them in the unit of the result, and NaN where nothing is known"
+        raise InputError(f"{problem}, column {column}", hint=hint)
+
+
 def _check_prior(surface: _Surface) -> None:
-    """Raise InputError for a prior that is negated, or in another unit than the normals."""
+    """Raise InputError for a prior that is negated, in another unit than the normals, or has values far from others."""
     step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
     equations = BilateralEquations.from_normals(coarse.normal_map, coarse.mask, coarse.camera_matrix)
@@ -217,6 +230,10 @@ def _check_prior(surface: _Surface) -> None:
             f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
             hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",
         )
+    assert surface.prior is not None
+    farthest = _FARTHEST * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
+    away = np.abs(surface.prior - np.nanmedian(surface.prior)) > farthest
+    _refuse(away, surface.mask, f"farther from their median than {_FARTHEST:g} times the width of the object")
 
 
 def _mask_of_normals(normal_map: Floats) -> Bools:

@@ -82,7 +82,7 @@ def _read_known(path: Path) -> tuple[str, bytes]:
         kind = content[:3].decode().lower()
     elif content.startswith(b"solid") or len(content) == 84 + 50 * triangles:
         kind = "stl"
-    elif b"\0" not in content and re.search(rb"^\s*v\s", content, re.MULTILINE):
+    elif b"\0" not in content and re.search(rb"^[ \t]*v\s", content, re.MULTILINE):
         kind = "obj"
     else:
         raise ValueError("it has none of these formats")

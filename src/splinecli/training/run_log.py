@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from splinecli.capture.layouts.result_names import CURVES, TRAINING_MAPS
 from splinecli.errors import OutputError
 from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.plotting import png_bytes
@@ -13,7 +14,7 @@ from splinecli.pictures.training_curves import training_figure
 from splinecli.system.extras import import_extra
 from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
-from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
+from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.tasks import SampleMaps
 
 
@@ -81,7 +82,7 @@ class RunLog:
         figure = observation_map_figure(
             maps.sparse, maps.dense, maps.truth, error_deg=maps.error_deg, truth_label="true map, gaps filled"
         )
-        write_bytes(self.folder / MAPS, figure)
+        write_bytes(self.folder / TRAINING_MAPS, figure)
 
 
 def read_metrics(path: Path) -> list[Metrics]:

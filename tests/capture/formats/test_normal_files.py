@@ -55,12 +55,12 @@ def test_floating_point_sources(tmp_path: Path, normals: NDArray[np.float64], na
     np.testing.assert_allclose(read, normals, atol=2e-7)
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy"])
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy", "a.mat"])
 @pytest.mark.parametrize(("bits", "error_deg"), [(16, 0.002), (8, 0.5)])  # half a step of each channel
 def test_pictures(write_image, tmp_path, normals, name, bits, error_deg):
     has_normal = normals.any(axis=2)
     picture = encode_picture(normals, has_normal, bits=bits)
-    path = write(tmp_path / name, picture) if name == "a.npy" else write_image(name, picture)
+    path = write_image(name, picture) if name in ("a.png", "a.tif") else write(tmp_path / name, picture)
     read = read_normals(path, MASK)
     assert not read[~has_normal].any()
     assert angle_between_deg(read[has_normal], normals[has_normal]).max() < error_deg
@@ -159,8 +159,13 @@ def test_a_huge_value_of_a_damaged_file_overflows_nothing(tmp_path: Path, normal
 
 
 def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+    """A double whose values are all whole lies as bytes; its class says that it is no picture."""
     plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
     scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
+    content = bytearray((tmp_path / "a.mat").read_bytes())
+    assert content[144] == 9  # class uint8, behind the header and two tags
+    content[144] = 6  # double
+    (tmp_path / "a.mat").write_bytes(content)
     np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", MASK), plane * MASK[..., None])
 
 

@@ -16,6 +16,7 @@ from scipy.io import savemat
 
 from scenes import png_chunk
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
+from splinecli.calibration.gray import measure_light_intensities
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
@@ -23,6 +24,7 @@ from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.errors import InputError
+from splinecli.pipeline.info import describe_capture
 
 HUGE = 30_000
 SMALL = (16, 18)
@@ -167,6 +169,22 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path: Path, monkeyp
     refused(lambda: open_capture(tmp_path).read(), match)
     with pytest.raises(InputError, match="3 images of 19000 x 19000 pixels"):
         open_capture(tmp_path).read([0, 1, 2])
+
+
+@pytest.mark.parametrize("size", [(754_974_744, 24), (2**31 - 1, 2**31 - 1)])
+def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, int]) -> None:
+    lights = np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.6, 0, 0.8)])
+    np.savetxt(tmp_path / "lights.txt", lights)
+    for number in range(4):
+        write_claim(tmp_path / f"{number}.png", *size)
+    match = rf"0\.png: found an image of {size[1]} x {size[0]} pixels.* expected at most 400 megapixels"
+    refused(lambda: describe_capture(tmp_path), match)
+    refused(lambda: open_capture(tmp_path).find_mask(), match)
+    refused(lambda: open_capture(tmp_path).read_mask(size), match)
+    refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full(SMALL, 99 + number, np.uint8))
+    refused(lambda: describe_capture(tmp_path), match.replace("0", "3", 1))
 
 
 def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Light files of MATLAB and OpenCV, written by SciPy and OpenCV themselves."""
 
+import time
 from pathlib import Path
 
 import cv2
@@ -63,6 +64,26 @@ def test_damaged_files(tmp_path: Path, name: str, content: bytes, problem: str) 
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=problem):
         read_light_directions(tmp_path / name, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "unit"),
+    [
+        ("a.yml", "", "\n"),
+        ("a.yml", "lights: ", "\n"),
+        ("a.yml", "lights: !!opencv-matrix", " \n"),
+        ("a.yml", "", "l: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1\n"),
+        ("a.xml", "", '<l type_id="opencv-matrix"><rows>1</rows><cols>3</cols><dt>d</dt><data>1'),
+    ],
+)
+def test_no_file_takes_a_time_that_grows_with_the_square_of_its_length(
+    tmp_path: Path, name: str, start: str, unit: str
+) -> None:
+    (tmp_path / name).write_text(start + unit * (900_000 // len(unit)))
+    started = time.process_time()
+    with pytest.raises(InputError, match="no matrix"):
+        read_light_directions(tmp_path / name, 3)
+    assert time.process_time() - started < 3  # the square took minutes to hours
 
 
 def test_slant_and_tilt_of_halcon(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ KEY = "Normal_gt"
 _TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_NUMERIC = range(6, 16)  # classes of arrays: double, single and whole numbers
+_CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
+"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that has them: a double may lie as bytes."""
 _COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
@@ -32,10 +33,11 @@ _MOST_NUMBERS = 1 << 20  # of a matrix of a small file
 
 
 class _Variable(NamedTuple):
-    """A numeric variable of a file: its name, its shape, and the place, length and byte order of its element."""
+    """A numeric variable of a file: its name, shape and type, and the place, length and byte order of its element."""
 
     name: str
     shape: tuple[int, ...]
+    dtype: str
     order: str
     start: int
     length: int
@@ -43,7 +45,7 @@ class _Variable(NamedTuple):
 
 
 def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
-    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type of the stored numbers.
+    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type that it has in MATLAB.
 
     Sizes are checked before anything is read or expanded.
 
@@ -79,7 +81,8 @@ def _numbers(file: BinaryIO, variable: _Variable) -> Array:
     most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
     content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
     kind, numbers = next(islice(_parts(content, variable.order), 3, None))
-    return np.frombuffer(numbers, variable.order + _NUMBERS[kind]).reshape(variable.shape, order="F")
+    stored = np.frombuffer(numbers, variable.order + _NUMBERS[kind])
+    return stored.astype(variable.dtype, copy=False).reshape(variable.shape, order="F")
 
 
 def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
@@ -96,10 +99,11 @@ def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
         if kind in (_COMPRESSED, _MATRIX):
             parts = _parts(_read(file, start, length, _START_BYTES, compressed=compressed), order)
             (flags, *_) = struct.unpack(order + "II", next(parts)[1])
-            if flags & 0xFF in _NUMERIC and not flags & _COMPLEX:
+            if flags & 0xFF in _CLASSES and not flags & _COMPLEX:
                 shape, name = next(parts)[1], next(parts)[1]
                 sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
-                yield _Variable(bytes(name).decode("latin-1"), sizes, order, start, length, compressed)
+                dtype = _CLASSES[flags & 0xFF]
+                yield _Variable(bytes(name).decode("latin-1"), sizes, dtype, order, start, length, compressed)
         file.seek(start + length)
     raise ValueError("the file has too many elements")
 

@@ -2,8 +2,7 @@
 
 Frame: x right, y up, z to the camera. A file is one of
 
-- MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array;
-- .npy: unsigned integers are a picture;
+- MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array; and .npy. Unsigned integers are a picture;
 - .txt: H*W rows of x y z in row-major order, for ground truth only;
 - a picture: n = 2 v / full scale - 1, black or mid-gray where there is no normal; a floating-point TIFF contains n
   itself.
@@ -112,11 +111,7 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Singles, bool]:
 
 
 def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
-    """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError.
-
-    Unsigned integers are a picture. In a .mat file they are not, because MATLAB stores all whole numbers as bytes, such
-    as the normals of a plane.
-    """
+    """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError."""
     check_file(path, "a normal map")
     suffix, alpha = path.suffix.lower(), None
     if suffix == ".mat":
@@ -132,7 +127,7 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
     else:
         values, alpha = decode_with_alpha(path, expected)
         check_vectors(values.shape, path)
-    return _Stored(values, alpha, suffix != ".mat" and values.dtype.kind == "u")
+    return _Stored(values, alpha, values.dtype.kind == "u")
 
 
 def _read_text(path: Path, height: int, width: int) -> Doubles:

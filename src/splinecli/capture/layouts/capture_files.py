@@ -9,6 +9,8 @@ from pathlib import Path
 
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
+from splinecli.capture.layouts.result_names import LIGHT_FILES as FOUND_LIGHTS
+from splinecli.capture.layouts.result_names import OWN_FILES, PLOTS
 from splinecli.capture.paths import check_file, find_mode, is_found_file, reading, resolve
 from splinecli.errors import InputError
 
@@ -137,14 +139,13 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-_WRITTEN = {
-    "normals", "normals_8bit", "error_map", "albedo", "confidence", "curvature", "relief", "preview", "depth", "mesh",
-    "found_mask", "calibration", "lights",
-}  # fmt: skip
-"""Stems of what splinecli writes, for an output folder that is also the capture's."""
-
-NOT_PHOTOGRAPHS = frozenset({Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)} | _WRITTEN)
-"""Lower-case stems of pictures in a capture's folder that are not images of the object under one light."""
+NOT_PHOTOGRAPHS = frozenset(
+    Path(name).stem
+    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *OWN_FILES, *FOUND_LIGHTS, *PLOTS)
+    if Path(name).suffix in IMAGE_SUFFIXES
+)
+"""Lower-case stems of pictures in a capture's folder that are not images of the object under one light. The folder of
+results may be the same."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,10 @@ from splinecli.maths.arrays import Doubles
 SUFFIXES = (".npy", ".mat", ".yml", ".yaml", ".xml")
 
 # OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
+# No part may run over what another one begins with: a file of 1 MB would take minutes.
 _YAML = re.compile(
-    r"^\s*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?\s+data:\s*\[([^\]]*)\]",
+    r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
+    r"\s+data:\s*\[([^][:]*)\]",
     re.MULTILINE,
 )
 _XML = re.compile(

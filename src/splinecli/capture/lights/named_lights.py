@@ -4,6 +4,7 @@ The names often come from another machine, with folders that do not exist here, 
 the folder are matched to them by base name, then by name without suffix, then by order.
 """
 
+import io
 import json
 import reprlib
 import sys
@@ -15,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_files import lights_of, read_light_table, unit_directions
+from splinecli.capture.lights.array_files import SUFFIXES as ARRAY_SUFFIXES
+from splinecli.capture.lights.light_files import lights_of, read_light_table, rows_text, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import RowForm, image_name
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 from splinecli.maths.arrays import Doubles
 from splinecli.system.files import parse_json
 
@@ -80,6 +82,25 @@ def read_lights(
     if table.names is None:
         return directions
     return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions)
+
+
+def check_writable(path: Path) -> None:
+    """Raise UsageError for a light file whose format is only read."""
+    suffix = path.suffix.lower()
+    if suffix not in (".lp", ".npy") and suffix in (*SUFFIXES, *ARRAY_SUFFIXES):
+        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint="Write .txt, .lp or .npy")
+
+
+def encode_lights(path: Path, directions: Doubles, images: Sequence[Path]) -> bytes:
+    """Return a light file of directions (F, 3) of images, in the format that its suffix names; see check_writable."""
+    suffix, text = path.suffix.lower(), rows_text(directions)
+    if suffix == ".npy":
+        np.save(file := io.BytesIO(), directions)
+        return file.getvalue()
+    if suffix == ".lp":
+        rows = zip(images, text.splitlines(), strict=True)
+        text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
+    return text.encode(errors="surrogateescape")
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
