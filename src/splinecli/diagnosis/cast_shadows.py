@@ -1,7 +1,7 @@
 """Tell bumps from hollows by the shadows that a surface casts on itself.
 
-With x and y of all lights negated, normals belong to the surface turned inside out. It has the same shading and the same
-attached shadows (Belhumeur, Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
+With x and y of all lights negated, the normals are those of the surface turned inside out. It has the same shading and
+the same attached shadows (Belhumeur, Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from splinecli.diagnosis.frame_evidence import RoughNormals
 from splinecli.maths.arrays import Bools, Doubles, Floats
 
 AGREEMENT_WEIGHT = 5.0
-"""Weight of a difference of agreements, beside those of light_check.py. Photographs of statues agree by 0.07 to 0.3 with
-right lights and below 0.01 with negated ones; synthetic bumps by 0.2 to 0.9."""
+"""Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9 with right
+lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01."""
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
 """From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other

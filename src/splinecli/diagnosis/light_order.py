@@ -23,7 +23,7 @@ from splinecli.capture.lights.light_fit import (
     swapped_orders,
 )
 from splinecli.capture.lights.light_rows import lights_of_half_vectors, zenith_as_elevation
-from splinecli.capture.robust_fit import fit_robustly, lit_values, shadow_weights
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, lit_values, shadow_weights
 from splinecli.diagnosis.light_rings import mend_rings
 from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 
@@ -71,10 +71,11 @@ FEWER_LEFT, MIN_HALF_MISFIT, WORSE_HALF_MISFIT = 0.6, 0.04, 0.05
 as a share of random orders', and under no kind of intensities are worse by the third. Of right lights, doubled angles
 leave at least as much, also where the values are encoded, or the lamps near."""
 
-EVENER_ALBEDO, MIN_ALBEDO_SPREAD = 0.4, 0.015
-"""A single ring fits as well at any elevation. Its lights are half vectors if doubled angles leave less than this share
-of the spread of the logarithm of the albedo, and that is above the second. On matte objects of one colour, half vectors
-brighten steep slopes by up to a third."""
+HALF_IN_ALBEDO, MIN_HALF_SPREAD = 0.65, 0.1
+"""A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this share of the expected
+change of the albedo, lights are half vectors, if the logarithm of that change has at least this standard deviation.
+Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors, below 0.4 with right lights
+and below 0.5 with near lamps."""
 
 LOWEST_DOUBLED = -0.1  # z of a doubled direction; half vectors of lights above the horizon are within 45 degrees
 
@@ -154,7 +155,11 @@ def check_order(
         found = best
     elif share > MIN_SWAP_MISFIT and exchanged.misfit < limit:
         found = exchanged
-    if found.words != HALF_VECTORS and found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(n_all)):
+    if (
+        found.words != HALF_VECTORS
+        and found.misfit > MIN_RING_MISFIT * usual
+        and np.array_equal(chosen, np.arange(n_all))
+    ):
         rings = _Reading(*mend_rings(compared, lights))
         if rings.words:
             tried.append(rings)
@@ -187,16 +192,22 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, d
         if other > given + WORSE_HALF_MISFIT:
             return False
         better |= bool(given > MIN_HALF_MISFIT and other < FEWER_LEFT * given)
-    spreads = [_albedo_spread(observations, reading) for reading in (lights, doubled)]
-    return better or bool(spreads[0] > MIN_ALBEDO_SPREAD and spreads[1] < EVENER_ALBEDO * spreads[0])
+    return better or _brighten_as_half_vectors(observations, lights, doubled)
 
 
-def _albedo_spread(observations: Floats, lights: Doubles) -> float:
-    """Return the median deviation of the logarithm of the albedo of some lit pixels from its median."""
+def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Doubles) -> bool:
+    """Return whether the albedo under lights (F, 3) changes with the slope as that under half vectors does."""
     chosen, values = lit_values(observations, LIT_SHARE, _FITTED_PIXELS)
-    scaled = fit_robustly(values, shadow_weights(values), lights, _FITS)[0]
-    albedo = np.log(np.linalg.norm(scaled, axis=1).clip(min=1e-9) * observations[chosen].max(axis=1))
-    return float(np.median(np.abs(albedo - np.median(albedo))))
+    lit = shadow_weights(values)
+    scaled = [fit_robustly(values, lit, reading, _FITS)[0] for reading in (lights, doubled)]
+    albedo, other = (np.log(np.linalg.norm(each, axis=1).clip(min=1e-9)) for each in scaled)
+    change = albedo - other
+    albedo += np.log(observations[chosen].max(axis=1))
+    terms, weights = np.stack((np.ones_like(change), change), axis=1), np.ones_like(change)
+    for _ in range(_FITS):
+        solution = np.linalg.lstsq(weights[:, None] * terms, weights * albedo, rcond=None)[0]
+        weights = np.sqrt(absolute_weights(albedo - terms @ solution))
+    return bool(solution[1] > HALF_IN_ALBEDO and change.std() > MIN_HALF_SPREAD)
 
 
 def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _Reading:

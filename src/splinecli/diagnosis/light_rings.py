@@ -78,8 +78,8 @@ def _descend(
 ) -> _Mended:
     """Return the best readings of rings from a start, changed one after the other."""
     mended, chosen = lights.copy(), list(start)
-    for ring, readings, reading in zip(rings, trials, chosen, strict=True):
-        mended[ring] = readings[reading][1]
+    for lamps, readings, reading in zip(rings, trials, chosen, strict=True):
+        mended[lamps] = readings[reading][1]
     misfit = float(factors.misfits(mended[None])[0])
     places = [(ring, reading) for ring, readings in enumerate(trials) for reading in range(len(readings))]
     for _ in range(2 * len(rings)):
@@ -93,8 +93,8 @@ def _descend(
         best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
         ring, chosen[ring] = places[best]
         mended, misfit = stack[best], float(misfits[best])
-    words = [(rings[ring], trials[ring][reading][0]) for ring, reading in enumerate(chosen)]
-    return _Mended(mended, misfit, [(ring, how) for ring, how in words if how])
+    words = [(lamps, readings[reading][0]) for lamps, readings, reading in zip(rings, trials, chosen, strict=True)]
+    return _Mended(mended, misfit, [(lamps, how) for lamps, how in words if how])
 
 
 def find_rings(lights: Doubles) -> Iterator[list[Integers]]:

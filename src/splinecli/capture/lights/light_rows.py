@@ -74,7 +74,7 @@ def zenith_as_elevation(light_directions: Doubles) -> Doubles:
 
 def lights_of_half_vectors(half_vectors: Doubles) -> Doubles:
     """Return the lights (..., 3) that a mirror with these unit normals reflects towards the camera."""
-    return 2 * half_vectors[..., 2:] * half_vectors - np.array((0.0, 0.0, 1.0))
+    return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
 
 
 def refuse_angles(table: NumberRows) -> None:
