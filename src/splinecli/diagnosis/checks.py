@@ -12,7 +12,9 @@ from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence, gray_intensities
 from splinecli.diagnosis.explanations import check_ground_truth
-from splinecli.diagnosis.light_check import LightCheck, light_warnings
+from splinecli.diagnosis.frame_evidence import median_turn_deg
+from splinecli.diagnosis.light_check import LightCheck
+from splinecli.diagnosis.light_warnings import light_warnings
 from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Floats
@@ -52,7 +54,7 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
             text = f"{name} is black. Its lamp failed. Photograph it again, or leave it out."
-            return [CaptureWarning(codes.IMAGE_ODD, text)]
+            return [CaptureWarning(codes.IMAGE_ODD, text, _turn_by_deg(seen, [seen.names.index(name)]))]
     odd = seen.light_check.odd_image
     if odd is None or odd.place in [shift.place for shift in seen.shifts]:
         return []
@@ -62,7 +64,16 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " the lights cannot explain is left. Its lamp was moved or failed, its exposure differs, or a shadow fell on"
         " the object. Photograph it again, or leave it out."
     )
-    return [CaptureWarning(codes.IMAGE_ODD, text)]
+    return [CaptureWarning(codes.IMAGE_ODD, text, _turn_by_deg(seen, [odd.place]))]
+
+
+def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
+    """Return by how many degrees images turn the normals, against those of the others; None with too few others."""
+    others = [place for place in range(len(seen.names)) if place not in places]
+    if len(others) < 3:
+        return None
+    observations, lights = seen.observations, seen.directions
+    return median_turn_deg(observations, lights, lights[others], observations[:, others])
 
 
 def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
@@ -93,7 +104,10 @@ def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
         text = (
             f"{first} and {second} are the same image{more}{differ}. Remove one, or replace it by its own photograph."
         )
-        yield CaptureWarning(codes.REPEATED_IMAGES, text)
+        # Either image of a pair may be the wrong one.
+        wrong = [sorted({pair[which] for pair in pairs}) for which in (0, 1)] if differ else []
+        errors_deg = [error for places in wrong if (error := _turn_by_deg(seen, places)) is not None]
+        yield CaptureWarning(codes.REPEATED_IMAGES, text, max(errors_deg, default=None))
 
 
 def rough_lights(seen: Evidence) -> list[CaptureWarning]:

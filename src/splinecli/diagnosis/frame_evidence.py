@@ -44,15 +44,38 @@ class RoughNormals:
 
     def curl(self) -> float:
         """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
+        if (found := self._derivatives_inside()) is None:
+            return float("nan")
+        (p_x, p_y), (q_x, q_y) = found
+        size = np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
+        return float(np.median(np.abs(p_y - q_x)) / max(np.median(size), 1e-12))
+
+    def least_curl_deg(self, *, mirrored: bool) -> float:
+        """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the least curl.
+
+        They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A rotation by 180 degrees
+        more has the same curl. NaN where there are too few pixels.
+        """
+        if (found := self._derivatives_inside()) is None:
+            return float("nan")
+        (p_x, p_y), (q_x, q_y) = found
+        p_x, p_y = (-p_x, -p_y) if mirrored else (p_x, p_y)
+        step = max(1, len(p_x) // _TURNED_PIXELS)
+        angles = np.radians(np.arange(-90, 90))[:, None]
+        # The slopes rotate with the normals.
+        curls = np.cos(angles) * (p_y - q_x)[::step] - np.sin(angles) * (p_x + q_y)[::step]
+        return float(np.median(np.abs(curls), axis=1).argmin() - 90)
+
+    def _derivatives_inside(self) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]] | None:
+        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None for too few."""
         from scipy.ndimage import binary_erosion
 
         z = np.maximum(self.normals[..., 2], _LOWEST_Z)
-        (p_x, p_y), (q_x, q_y) = (_derivatives(-self.normals[..., axis] / z) for axis in (0, 1))
         inside = binary_erosion(self.mask & (self.normals[..., 2] > _LOWEST_Z))
         if inside.sum() < 50:
-            return float("nan")
-        size = np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)[inside]
-        return float(np.median(np.abs(p_y - q_x)[inside]) / max(np.median(size), 1e-12))
+            return None
+        p, q = (_derivatives(-self.normals[..., axis] / z) for axis in (0, 1))
+        return (p[0][inside], p[1][inside]), (q[0][inside], q[1][inside])
 
     def rim(self) -> float:
         """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.

@@ -5,19 +5,22 @@ classes of materials, 6 to 48 lights, with and without errors of their direction
 figures.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, LightFrame
-from splinecli.diagnosis.frame_evidence import rough_normals
-from splinecli.diagnosis.light_order import MIN_LIGHTS, UNKNOWN_ORDER, ZENITH, check_order
+from splinecli.diagnosis.cast_shadows import ShadowCheck
+from splinecli.diagnosis.frame_evidence import RoughNormals, median_turn_deg, rough_normals
+from splinecli.diagnosis.light_order import (
+    MAX_MENDED,
+    MIN_LIGHTS,
+    UNKNOWN_ORDER,
+    check_order,
+)
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
 from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 
@@ -27,6 +30,16 @@ CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
 NEAR = 0.1  # candidates whose advantages differ by less are near equals
 LOWEST_CURL = 0.1  # Curls below this are noise. On a cap of a sphere, other frames give little more.
+
+LEAST_ROTATION_DEG = 10  # from any frame; smaller rotations are errors of a calibration
+ROTATED = 2.0
+"""Smallest advantage of lights rotated about the view axis by any angle: it is fitted, so it wins a little by noise."""
+
+OPEN_ERROR_DEG = 10.0
+"""Error stated where a bump cannot be told from a hollow although shadows of the given lights are missing: with it,
+about a quarter of the normals of a good capture are expected within 5 degrees."""
+
+_RANDOM_ORDERS = 3  # of the lights, under which the normals of an unknown order are compared with the given ones
 
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
@@ -41,6 +54,7 @@ class Candidate:
     matrix: Doubles = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
     curl: float  # of the normals; 0 is a surface
     rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
+    is_order: bool = False  # whether it is another order of the lights
     steps: int = 0  # by how many lights it shifts the order
     advantage: float = 0.0  # evidence for it against the given lights; from 1 it is better
 
@@ -60,8 +74,13 @@ class LightCheck:
     best: Candidate | None
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its misfit
     outline_counts: float  # how much the normals at the mask's edge count, from 0 to 1
-    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no order fits
+    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no reading
+    # clearly is
     mended: Doubles | None
+    # the median angle by which the given lights turn the normals, if the best reading is right; None if the given is
+    error_deg: float | None = None
+    shadows_tell: bool = False  # whether cast shadows show that the given lights are not those with x and y negated
+    lacks_shadows: bool = False  # whether they speak against the given lights, but not for others
     # an image that contradicts the others, without which all this was found; None if there is none
     odd_image: OddImage | None = None
 
@@ -79,9 +98,14 @@ class LightCheck:
             return missing
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
-        elif 2 * RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) < 1:
+        elif not (self.outline_tells or self.shadows_tell):
             missing.append("whether x and y are both negated (the mask's edge is no clear outline of the object)")
         return missing
+
+    @property
+    def outline_tells(self) -> bool:
+        """Whether the outline shows that x and y are not both negated."""
+        return bool(2 * RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) >= 1)
 
 
 def check_lights(
@@ -126,35 +150,107 @@ def _check_frame_and_order(
 ) -> LightCheck:
     """Return what check_lights does, for images that do not contradict each other."""
     found = check_order(observations, factors, light_directions, chosen, names)
-    normals = rough_normals(observations / found.intensities, found.lights, mask)
+    observations = observations / found.intensities
+    normals = rough_normals(observations, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
     weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
 
-    def candidate(name: str, frame: LightFrame | None, matrix: Doubles, steps: int = 0) -> Candidate:
+    def candidate(name: str, frame: LightFrame | None, matrix: Doubles, **kind: Any) -> Candidate:
         turned = normals.transformed(matrix)
-        return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, steps)
+        return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, **kind)
 
     given, *others = (candidate(frame.describe() or "as given", frame, frame.matrix) for frame in PLANE_FRAMES)
-    others += [candidate(turn.words, None, turn.matrix, turn.steps) for turn in found.turns]
+    others += [candidate(turn.words, None, turn.matrix, is_order=True, steps=turn.steps) for turn in found.turns]
+    others += [candidate(name, None, matrix) for name, matrix in _rotations(normals)]
     judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
-    ranked = sorted(judged, key=lambda other: -other.advantage)
-    order, mended = found.order, None
     # Where no order fits, the normals are no evidence.
+    fits = found.order != UNKNOWN_ORDER and bool(np.isfinite(given.curl))
+    evidence = _by_shadows(judged, given, ShadowCheck.of(observations, found.lights, normals)) if fits else None
+    judged = judged if evidence is None else evidence.judged
+    ranked = sorted(judged, key=lambda other: -other.advantage)
+    # Rotations are listed only where they count.
+    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= ROTATED]
+    order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
     if best is not None:
         mended = found.lights @ best.matrix.T
     elif order not in (None, UNKNOWN_ORDER):
         mended = found.lights
-    if order is not None and best is not None and best.frame is None:
+    lights = light_directions[chosen]
+    if order == UNKNOWN_ORDER:
+        rng = np.random.default_rng(0)
+        orders = [rng.permutation(lights) for _ in range(_RANDOM_ORDERS)]
+        turn_deg = float(np.median([median_turn_deg(observations, lights, others) for others in orders]))
+    elif mended is not None:
+        turn_deg = median_turn_deg(observations, lights, mended)
+    if order is not None and best is not None and best.is_order:
         order, best = best.name, None  # one of several orders that fit, told by the normals
-    return LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended)
+    check = LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None)
+    tie = best is not None and mirror_twin(check, best) is not None
+    clear = not tie and not found.misfit > MAX_MENDED
+    return replace(
+        check,
+        mended=mended if clear else None,
+        error_deg=turn_deg,
+        shadows_tell=evidence is not None and evidence.tell,
+        lacks_shadows=evidence is not None and evidence.missing and not (order or best or check.outline_tells),
+    )
+
+
+def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Doubles]]:
+    """Yield rotations of the lights about the view axis after which the normals have the least curl, in words."""
+    for mirrored in (False, True):
+        least_deg = normals.least_curl_deg(mirrored=mirrored)
+        if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < LEAST_ROTATION_DEG:
+            continue
+        for degrees in (least_deg, least_deg - np.copysign(180, least_deg)):
+            cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+            matrix = np.array(((cos, -sin, 0), (sin, cos, 0), (0, 0, 1))) @ np.diag((-1.0 if mirrored else 1.0, 1, 1))
+            negated = "x negated and " if mirrored else ""
+            yield f"{negated}rotated by {degrees:.0f} degrees about the view axis", matrix
+
+
+class _ShadowEvidence(NamedTuple):
+    judged: list[Candidate]  # with it
+    tell: bool  # whether shadows show that the given lights are not those with x and y negated
+    missing: bool  # whether the given lights lack shadows
+
+
+def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -> _ShadowEvidence:
+    """Return candidates after cast shadows told the given reading and the best other one from their twins."""
+    shadows, best = check.shadows(given.matrix), max(judged, key=lambda other: other.advantage)
+    told = {}
+    for one in (given, best):
+        twin = _negated(judged, one)
+        if twin is not None and (one is given or one.advantage >= 1):
+            found = shadows if one is given else check.shadows(one.matrix)
+            told[twin.name] = found, check.shadows(twin.matrix)
+    judged = [
+        replace(other, advantage=other.advantage + told[other.name][0].evidence(told[other.name][1]))
+        if other.name in told
+        else other
+        for other in judged
+    ]
+    both = next(other for name, (_, other) in told.items() if name == BOTH_NEGATED.describe())
+    return _ShadowEvidence(judged, shadows.evidence(both) < -TOLD_APART, shadows.leaves_open(both))
+
+
+def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:
+    """Return the candidate with x and y negated in addition."""
+    matrix = BOTH_NEGATED.matrix @ one.matrix
+    return next((other for other in candidates if np.allclose(other.matrix, matrix, atol=1e-6)), None)
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
+    simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
+    if better and better[0].advantage > (simple[0].advantage if simple else 0) + TOLD_APART:
+        better = [candidate for candidate in better if candidate not in simple] or better
+    else:
+        better = simple
     near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]
-    preferred = [candidate for candidate in near if (candidate.frame is None) == in_order]
+    preferred = [candidate for candidate in near if candidate.is_order == in_order]
     return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
 
 
@@ -164,75 +260,10 @@ def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
     return float(CURL_WEIGHT * np.nan_to_num(curls) + RIM_WEIGHT * np.nan_to_num(rims))
 
 
-def light_warnings(
-    check: LightCheck, light_file: Path, frame: LightFrame, *, strict: bool = False
-) -> list[CaptureWarning]:
-    """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
-
-    If `strict`, also warn of what the images do not tell, as they do not of most reliefs without an outline.
-    """
-    warnings = []
-    if check.order is not None:
-        code = codes.LIGHT_FRAME if check.order == ZENITH else codes.LIGHT_ORDER
-        warnings.append(CaptureWarning(code, _order_text(check, light_file)))
-    if check.best is not None:
-        code = codes.LIGHT_FRAME if check.best.frame is not None else codes.LIGHT_ORDER
-        warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file)))
-    if strict and check.unchecked:
-        text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
-        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
-    return warnings
-
-
-def _order_text(check: LightCheck, light_file: Path) -> str:
-    given = 100 * check.given_misfit
-    if check.order == UNKNOWN_ORDER:
-        return (
-            f"The images fit {light_file.name} no better than lights in a random order"
-            f" (misfit {given:.0f} % of a random order's). Its lines are in another order than the"
-            " images, or it belongs to another capture."
-        )
-    remedy = "Check that its lines are in the order of the images."
-    if check.order == ZENITH:
-        remedy = "Replace each elevation by 90 degrees minus it."
-    return (
-        f"The images fit the lights of {light_file.name} much better {check.order}"
-        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
-    )
-
-
-def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
-    pairs = (("curl", best.curl, check.given.curl, ".2f"), ("outline", best.rim, check.given.rim, "+.2f"))
-    figures = [
-        f"{name} {one:{form}} against {other:{form}}"
-        for name, one, other, form in pairs
-        if f"{one:{form}}" != f"{other:{form}}"
-    ]
-    twin = mirror_twin(check, best)
-    words = best.name if best.frame is None else f"with {best.name}"
-    if twin is not None:
-        words += f" or with {twin.name}"
-    text = f"The lights give normals that fit a surface much better {words} ({', '.join(figures)})"
-    if best.frame is None:
-        return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
-    advice = f"{text}: run again with --light-frame {best.frame.after(frame)}."
-    if twin is not None and twin.frame is not None:
-        return (
-            f"{advice[:-1]} or {twin.frame.after(frame)}. They exchange hollows and bumps; without a closed outline,"
-            " only you can tell which is right."
-        )
-    if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
-        advice += " If the object is hollow up to its outline, as the inside of a bowl, the lights are right."
-    return advice
-
-
 def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
     """Return the reading with x and y negated in addition, if the evidence cannot tell it from the best one."""
-    if best.frame is None:
-        return None
-    frame = BOTH_NEGATED.after(best.frame)
-    twin = next(candidate for candidate in check.candidates if candidate.frame == frame)
-    return twin if twin is not check.given and twin.advantage > best.advantage - TOLD_APART else None
+    twin = _negated(check.candidates, best)
+    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - TOLD_APART else None
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:

@@ -8,12 +8,13 @@ The thresholds were chosen on the same captures as those of light_check.py.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from splinecli.capture.lights.light_fit import (
+    LIT_SHARE,
     Factors,
     fit_residual,
     random_misfits,
@@ -21,7 +22,8 @@ from splinecli.capture.lights.light_fit import (
     shifted_orders,
     swapped_orders,
 )
-from splinecli.capture.lights.light_rows import zenith_as_elevation
+from splinecli.capture.lights.light_rows import lights_of_half_vectors, zenith_as_elevation
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, lit_values, shadow_weights
 from splinecli.diagnosis.light_rings import mend_rings
 from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
 
@@ -61,13 +63,29 @@ UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple
 ZENITH = "if their elevations count from the camera axis"
 """The reading of lights whose file has zenith angles in place of elevations, in words."""
 
+HALF_VECTORS = "if they are half vectors, as the normals of a mirror ball at its highlights"
+"""The reading of lights half-way between the true ones and the camera axis, in words."""
+
+FEWER_LEFT, MIN_HALF_MISFIT, WORSE_HALF_MISFIT = 0.6, 0.04, 0.05
+"""Lights are half vectors if doubled angles from the axis leave less than the first share of a misfit above the second,
+as a share of random orders', and under no kind of intensities are worse by the third. Of right lights, doubled angles
+leave at least as much, also where the values are encoded, or the lamps near."""
+
+HALF_IN_ALBEDO, MIN_HALF_SPREAD = 0.65, 0.1
+"""A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this share of the expected
+change of the albedo, lights are half vectors, if the logarithm of that change has at least this standard deviation.
+Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors, below 0.4 with right lights
+and below 0.5 with near lamps."""
+
+LOWEST_DOUBLED = -0.1  # z of a doubled direction; half vectors of lights above the horizon are within 45 degrees
+
 RANDOM_FIT = 0.7
 """Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
 
 MAX_PLAIN_MISFIT, MAX_FREE_MISFIT = 0.5, 0.35
 """Above these misfits under known and free intensities, as shares of random orders', normals are not plausible."""
 
-_FITTED_PIXELS, _FITTED_ORDERS = 800, 9
+_FITTED_PIXELS, _FITTED_ORDERS, _FITS = 800, 9, 5
 
 
 class Turn(NamedTuple):
@@ -126,13 +144,22 @@ def check_order(
     exchanged, zenith = _best_exchange(compared, lights, names), zenith_as_elevation(lights)
     of_angles = _Reading(ZENITH, zenith, float(compared.misfits(zenith[None])[0]))
     tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
+    doubled = lights_of_half_vectors(lights)
+    if doubled[:, 2].min() > LOWEST_DOUBLED:
+        tried.append(_Reading(HALF_VECTORS, doubled, float(compared.misfits(doubled[None])[0])))
     limit = min(given.misfit * (BETTER_ORDER_OF_FEW if len(lights) <= FEW else BETTER_ORDER), MAX_MENDED * usual)
     best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
-    if share > MIN_MISFIT and best.misfit < limit:
+    if tried[-1].words == HALF_VECTORS and _are_half_vectors(observations, factors, lights, doubled):
+        found = tried[-1]
+    elif share > MIN_MISFIT and best.misfit < limit:
         found = best
     elif share > MIN_SWAP_MISFIT and exchanged.misfit < limit:
         found = exchanged
-    if found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(n_all)):
+    if (
+        found.words != HALF_VECTORS
+        and found.misfit > MIN_RING_MISFIT * usual
+        and np.array_equal(chosen, np.arange(n_all))
+    ):
         rings = _Reading(*mend_rings(compared, lights))
         if rings.words:
             tried.append(rings)
@@ -153,6 +180,34 @@ def check_order(
         tuple((str(reading.words), reading.misfit / usual) for reading in tried),
         turns,
     )
+
+
+def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, doubled: Doubles) -> bool:
+    """Return whether the lights (F, 3) with doubled angles from the axis fit clearly better."""
+    better = False
+    for known in (True, False):
+        compared = replace(factors, intensities_known=known)
+        usual = float(np.median(random_misfits(compared, lights)))
+        given, other = compared.misfits(np.stack((lights, doubled))) / max(usual, 1e-9)
+        if other > given + WORSE_HALF_MISFIT:
+            return False
+        better |= bool(given > MIN_HALF_MISFIT and other < FEWER_LEFT * given)
+    return better or _brighten_as_half_vectors(observations, lights, doubled)
+
+
+def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Doubles) -> bool:
+    """Return whether the albedo under lights (F, 3) changes with the slope as that under half vectors does."""
+    chosen, values = lit_values(observations, LIT_SHARE, _FITTED_PIXELS)
+    lit = shadow_weights(values)
+    scaled = [fit_robustly(values, lit, reading, _FITS)[0] for reading in (lights, doubled)]
+    albedo, other = (np.log(np.linalg.norm(each, axis=1).clip(min=1e-9)) for each in scaled)
+    change = albedo - other
+    albedo += np.log(observations[chosen].max(axis=1))
+    terms, weights = np.stack((np.ones_like(change), change), axis=1), np.ones_like(change)
+    for _ in range(_FITS):
+        solution = np.linalg.lstsq(weights[:, None] * terms, weights * albedo, rcond=None)[0]
+        weights = np.sqrt(absolute_weights(albedo - terms @ solution))
+    return bool(solution[1] > HALF_IN_ALBEDO and change.std() > MIN_HALF_SPREAD)
 
 
 def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _Reading:

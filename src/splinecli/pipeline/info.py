@@ -147,7 +147,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
                    f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface"),
     ]  # fmt: skip
     if "mended_lights" in report:
-        rows.append(("mended", report["mended_lights"] or "not written: no other reading of the lights fits better"))
+        rows.append(
+            ("mended", report["mended_lights"] or "not written: no other reading of the lights fits clearly better")
+        )
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
 
 

@@ -72,6 +72,11 @@ def zenith_as_elevation(light_directions: Doubles) -> Doubles:
     return np.concatenate((across, level), axis=-1)
 
 
+def lights_of_half_vectors(half_vectors: Doubles) -> Doubles:
+    """Return the lights (..., 3) that a mirror with these unit normals reflects towards the camera."""
+    return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
+
+
 def refuse_angles(table: NumberRows) -> None:
     """Raise InputError for rows that are plainly angles: two columns, or with a count, or with one radius for all."""
     rows = [row.numbers for row in table.rows]
