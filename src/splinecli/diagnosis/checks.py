@@ -46,7 +46,7 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
         f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
-    yield CaptureWarning(codes.IMAGES_SHIFTED, text)
+    yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:

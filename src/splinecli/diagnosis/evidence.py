@@ -15,8 +15,10 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.paths import reading
 from splinecli.capture.sample import Sample
+from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
 from splinecli.system.files import equal_files
@@ -119,4 +121,23 @@ class Evidence:
 
     @cached_property
     def shifts(self) -> list[ImageShift]:
-        return find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+        found = find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+        if self.found or self.light_check.order is not None:
+            return found
+        step = self.sample.step
+        of_shading = shading_shifts(self.evened, self.directions)
+        shifts = {shift.place: shift for shift in found}
+        shifts |= {place: ImageShift(place, step * right, step * down) for place, (right, down) in of_shading.items()}
+        return [shifts[place] for place in sorted(shifts)]
+
+    @cached_property
+    def shift_error_deg(self) -> float | None:
+        """The median angle by which shifted images turn the normals; None where too few pixels are left."""
+        if self.found:
+            return None
+        step = self.sample.step
+        shifts = {shift.place: (round(shift.right / step), round(shift.down / step)) for shift in self.shifts}
+        known, values = moved_back(self.evened, shifts)
+        if not known.any():
+            return None
+        return median_turn_deg(self.evened.observations[known], self.directions, self.directions, values[known])
