@@ -36,6 +36,7 @@ ESTIMATED_LIGHTS = "estimated_lights"
 EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
 GROUND_TRUTH_FRAME = "ground_truth_frame"
+GROUND_TRUTH_SHIFTED = "ground_truth_shifted"
 GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
@@ -64,7 +65,7 @@ UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
 PROBABLY_WRONG = frozenset({
-    ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR,
+    ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_SHIFTED, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR,
     LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, REPEATED_IMAGES,
 })  # fmt: skip
 """Warnings that say that an input is probably wrong. With --strict they are errors."""

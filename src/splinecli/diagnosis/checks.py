@@ -12,7 +12,8 @@ from splinecli.capture.restore.light_intensities import estimate_light_intensiti
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence
-from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
+from splinecli.diagnosis.explanations import encoded_values, near_lamps
+from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Floats

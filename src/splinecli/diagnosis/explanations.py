@@ -1,6 +1,6 @@
-"""What else would explain the images: encoded values, near lamps, or a ground truth in another frame.
+"""What else would explain the images: encoded values, or near lamps.
 
-For the first two, a matte model is fitted to a sample as the capture says it is, and under the other reading. Both fits
+A matte model is fitted to a sample as the capture says it is, and under the other reading. Both fits
 are compared where the values are stored: what the second leaves, as a share of what the first leaves. The thresholds
 were chosen on rendered captures with and without these faults (benchmarks/capture_faults.py), of all classes of
 materials.
@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_values, shade
 from splinecli.capture.sample import Sample
-from splinecli.diagnosis.frame_evidence import rough_normals
 from splinecli.maths.arrays import Doubles, Floats, Integers
-from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.normals import unit
 
 DISPLAY_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 
@@ -34,12 +32,6 @@ NEAR_RATIO, NEAR_RATIO_ROUND = 0.84, 0.6
 ROUND = 0.85
 """Share of the places' variance that normals predict, from which an object is round: on a ball, gloss varies with the
 place as the light of near lamps does."""
-
-MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
-"""A ground truth is in another frame if its median angle to the rough normals is above the first, and another frame
-leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
-
-_FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
 
 MIN_LIGHTS = 8
 _MIN_MISFIT = 0.006  # of a pixel's largest value; less is noise and rounding
@@ -77,33 +69,6 @@ def near_lamps(sample: Sample, light_directions: Doubles) -> list[CaptureWarning
         f" --light-distance {near[0]:.1f} --object-width 1."
     )
     return [CaptureWarning(codes.LAMPS_NEAR, text)]
-
-
-def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
-    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame.
-
-    It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
-    """
-    if truth is None:
-        return []
-    truth = truth[:: sample.step, :: sample.step]
-    known = sample.mask & truth.any(axis=2)
-    if not known.any():
-        return []
-    normals = rough_normals(sample.observations, light_directions, sample.mask).normals[known]
-    angles = [float(np.median(angle_between_deg(normals, truth[known] @ frame.matrix.T))) for frame in _FRAMES]
-    best = int(np.argmin(angles))
-    if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
-        return []
-    frame = _FRAMES[best]
-    code, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
-    if frame.signs[2] < 0:
-        code, lights = codes.GROUND_TRUTH_Z, ""
-    text = (
-        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
-        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
-    )
-    return [CaptureWarning(code, text)]
 
 
 def near_distance(sample: Sample, light_directions: Doubles) -> tuple[float, float] | None:
