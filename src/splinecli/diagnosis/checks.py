@@ -10,9 +10,11 @@ from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
+from splinecli.capture.robust_fit import fit_robustly
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.explanations import encoded_values, near_lamps
+from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
@@ -32,6 +34,11 @@ UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
 """Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
 that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
 
+SCALES, SCALE_TOLERANCE = (4, 6, 8), 0.2
+"""The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the brightness of an
+image may differ from them."""
+
+_FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
 _MOST_NAMED = 4  # shifted images in a sentence
 
 Check = Callable[[Evidence], Iterable[CaptureWarning]]
@@ -48,6 +55,30 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
         f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
     yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
+
+
+def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
+    """Warn of an image with the values of a camera of fewer bits than the files of the others."""
+    values, lights = np.asarray(seen.observations, np.float64), seen.directions
+    values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may outshine the others
+    predicted = fit_robustly(values, np.ones_like(values), lights, _FITS)[0] @ lights.T
+    lit = predicted > _LIT
+    for place, name in enumerate(seen.names):
+        if np.count_nonzero(lit[:, place]) < _LEAST_PIXELS:
+            continue
+        factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
+        stops = abs(np.log2(max(factor, 1e-6)))
+        bits = min(SCALES, key=lambda bits: abs(bits - stops))
+        if abs(bits - stops) > SCALE_TOLERANCE:
+            continue
+        mended = seen.observations.copy()
+        mended[:, place] /= factor
+        how = f"{1 / factor:.0f} times darker" if factor < 1 else f"{factor:.0f} times brighter"
+        text = (
+            f"{name} is {how} than the other images predict, as if its values had {16 - bits} bits and those of the"
+            f" others 16, or the other way round. Save all images in one way, or scale it by 2^{bits}."
+        )
+        yield CaptureWarning(codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended))
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
@@ -146,7 +177,8 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (same_images, frozenset()),
     (shifted_images, frozenset()),
-    (odd_image, REPEATED),
+    (other_scale, REPEATED),
+    (odd_image, REPEATED | {codes.IMAGE_SCALE}),
     (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), REPEATED),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),

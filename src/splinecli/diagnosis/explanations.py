@@ -1,9 +1,8 @@
 """What else would explain the images: encoded values, or near lamps.
 
-A matte model is fitted to a sample as the capture says it is, and under the other reading. Both fits
-are compared where the values are stored: what the second leaves, as a share of what the first leaves. The thresholds
-were chosen on rendered captures with and without these faults (benchmarks/capture_faults.py), of all classes of
-materials.
+A matte model is fitted to a sample as the capture says it is, and under the other reading. Both fits are compared where
+the values are stored: what the second leaves, as a share of what the first leaves. The thresholds were chosen on
+rendered captures with and without these faults (benchmarks/capture_faults.py), of all classes of materials.
 """
 
 import numpy as np

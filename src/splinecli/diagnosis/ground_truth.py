@@ -15,10 +15,10 @@ MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
 leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
 
 REACH = 0.15  # the largest shift that is looked for, as a share of the smaller side of the object
-SHIFT_LEFT, SHIFT_FALL_DEG = 0.65, 1.0
-"""A ground truth is shifted if a shift leaves at most this share of the median angle, and takes so much from it. It must
-also leave less than this share of what a rotation leaves: lights that are all tilted turn the normals of a ball nearly
-as a shift does."""
+SHIFT_LEFT, SHIFT_FALL_DEG = 0.65, 1.5
+"""A ground truth is shifted if a shift leaves at most this share of the median angle, and takes so much from it. It
+must also leave less than this share of what a rotation leaves: lights that are all tilted turn the normals of a ball
+nearly as a shift does."""
 
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
 _MOST_PIXELS = 4000  # of each comparison
@@ -37,9 +37,7 @@ def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats 
     if not known.any():
         return []
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals
-    angles = [
-        float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES
-    ]
+    angles = [float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES]
     best = int(np.argmin(angles))
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
         return _shifted(normals, truth, sample)
@@ -99,7 +97,7 @@ def _angles_deg(normals: Doubles, truth: Floats, shift: tuple[int, int]) -> tupl
     here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
     there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
     moved = truth[there]
-    known: Bools = normals[here].any(axis=2) & moved.any(axis=2) & truth[here].any(axis=2)
+    known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
     if np.count_nonzero(known) < max(1, _LEAST_OVERLAP * np.count_nonzero(normals.any(axis=2))):
         return 180.0, 0.0
     every = slice(None, None, -(-int(np.count_nonzero(known)) // _MOST_PIXELS))

@@ -15,7 +15,9 @@ from splinecli.capture.sample import Sample
 from splinecli.maths.arrays import Bools, Doubles
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
-REACH = 0.15  # the largest shift that is looked for, as a share of the smaller side of the object
+REACH, COUNTED = 0.2, 0.75
+"""Shifts are compared up to this share of the smaller side of the object, and count up to that share of it: where a
+model is wrong in another way, the residual often falls on and on."""
 
 LEAST_FALL, MOST_LEFT, MOST_LEFT_OF_FEW = 0.05, 0.5, 0.35
 """A shift counts if the residual falls by the first, as a share of the image's brightness, and to the second or less of
@@ -137,7 +139,7 @@ class _MatteModel:
         kept = ~shadow & (values <= _HIGHLIGHT[0] * predicted + _HIGHLIGHT[1])
         if kept.mean() < _LEAST_KEPT:
             return None
-        good, scaled = self._map(normals.any(axis=1)), self._map(normals * self._top[:, None])
+        good, scaled = self._map(np.asarray(normals.any(axis=1))), self._map(normals * self._top[:, None])
         kept, image = self._map(kept), self._map(image * kept)
         products = np.stack([scaled[row] * scaled[column] for row in range(3) for column in range(3)])
         overlap = self._sums(good, kept)
@@ -154,7 +156,7 @@ class _MatteModel:
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
     def find(self, place: int) -> tuple[float, Shift]:
-        """Return the shift of an image at which the model leaves least, and by how much less; 0 if it does not count."""
+        """Return the shift at which the model leaves least of an image, and by how much less; 0 if it does not count."""
         compared = self._compared(place)
         if compared is None:
             return _NO_SHIFT
@@ -198,7 +200,7 @@ class _MatteModel:
         array[..., self.mask] = values.T
         return array
 
-    def _sums(self, first: Doubles, second: Doubles) -> Doubles:
+    def _sums(self, first: Doubles, second: Doubles | Bools) -> Doubles:
         """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right) within reach."""
         from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -215,8 +217,8 @@ def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float)
     reach = len(left) // 2
     shift = int(column) - reach, int(row) - reach
     before, after = float(unmoved[row, column]), float(left[row, column])
-    at_edge = max(map(abs, shift)) == reach  # the least may lie beyond
-    counts = shift != (0, 0) and not at_edge and before - after >= least_fall and after <= most_left * before
+    near = 0 < max(map(abs, shift)) <= COUNTED * reach
+    counts = near and before - after >= least_fall and after <= most_left * before
     return (before - after, shift) if counts and before <= MOST_RESIDUAL else _NO_SHIFT
 
 
