@@ -37,10 +37,12 @@ ESTIMATED_LIGHTS = "estimated_lights"
 EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
 GROUND_TRUTH_FRAME = "ground_truth_frame"
+GROUND_TRUTH_SHIFTED = "ground_truth_shifted"
 GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
 IMAGE_ODD = "image_odd"
+IMAGE_SCALE = "image_scale"
 IMAGES_LEFT_OUT = "images_left_out"
 IMAGES_SHIFTED = "images_shifted"
 LIGHTS_CROWDED = "lights_crowded"
@@ -51,6 +53,7 @@ LIGHTS_MATCHED = "lights_matched"
 LIGHTS_UNCHECKED = "lights_unchecked"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
+MASK_INVERTED = "mask_inverted"
 NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
 NOT_DISTILLED = "not_distilled"
@@ -65,8 +68,9 @@ UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
 PROBABLY_WRONG = frozenset({
-    CONSTANT_LIGHT, ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, IMAGE_ODD, IMAGES_SHIFTED, LAMP_DISTANCE,
-    LAMPS_NEAR, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, REPEATED_IMAGES, UNEQUAL_INTENSITIES,
+    CONSTANT_LIGHT, ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_SHIFTED, GROUND_TRUTH_Z, IMAGE_ODD, IMAGE_SCALE,
+    IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, MASK_INVERTED,
+    REPEATED_IMAGES, UNEQUAL_INTENSITIES,
 })  # fmt: skip
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 
@@ -79,6 +83,12 @@ def white_level(level: WhiteLevel | None) -> list[CaptureWarning]:
         return []
     text = f"The images look clipped at {level.value:g}, so this value counts as saturated."
     return [CaptureWarning(WHITE_LEVEL, f"{text} Use --white-level N to set another value.")]
+
+
+def mask_inverted(name: str) -> CaptureWarning:
+    """Say that a mask is probably black on the object."""
+    text = f"{name} leaves out a bright area in the middle and keeps what surrounds it: it is probably inverted."
+    return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
 
 
 def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:

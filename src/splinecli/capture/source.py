@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
+from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
 from splinecli.capture.formats.damage import stderr_is_apart
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize, check_capture, check_stored_size, common_size
@@ -30,7 +30,7 @@ from splinecli.capture.linearise import (
     pixel_reader,
 )
 from splinecli.capture.record import Capture, check_light_indices
-from splinecli.capture.restore.auto_mask import find_object
+from splinecli.capture.restore.auto_mask import find_object, looks_inverted, surrounds_hole
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
@@ -38,6 +38,7 @@ from splinecli.maths.arrays import Bools, Doubles, Integers
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
+_IMAGES_OF_MASK = 3  # of which the brightness outside the mask is looked at
 Progress = Callable[[], object]  # called once after each image
 
 
@@ -107,7 +108,7 @@ class CaptureSource:
             text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
             warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
-        warnings += of_lamps
+        warnings += [*of_lamps, *self.mask_warnings(mask, indices)]
         capture = Capture(
             name=self.files.name,
             observations=observations,
@@ -159,6 +160,16 @@ class CaptureSource:
             hint = "Choose another --crop, or a larger --scale"
             raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
+
+    def mask_warnings(self, mask: Bools, indices: Sequence[int]) -> list[CaptureWarning]:
+        """Warn of a mask (H, W) from a file that is probably inverted. Raises InputError."""
+        path = self.files.mask
+        if path is None or self.automatic_mask is not None or not surrounds_hole(mask):
+            return []
+        few = [indices[place] for place in np.linspace(0, len(indices) - 1, _IMAGES_OF_MASK).astype(int)]
+        images = self.read_pixels(np.ones_like(mask), few, StoredPixels.observe)
+        brightness = np.sum(list(images), axis=0).reshape(mask.shape)
+        return [mask_inverted(path.name)] if looks_inverted(mask, brightness) else []
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
         """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""

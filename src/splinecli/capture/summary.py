@@ -1,6 +1,7 @@
 """Summary of a capture without normals: sizes, exposure and lights."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from splinecli.capture.window import WHOLE
 from splinecli.maths.arrays import Doubles
 
 DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
+_FULL_SCALE = 65_535  # of 16-bit files
 FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
 NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the camera axis carries a warning
 _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
@@ -46,6 +48,8 @@ class CaptureSummary:
     # some of the pixels of all images, on a grid, and every pixel of the middle; None where images have different sizes
     samples: tuple[Sample, Sample] | None
     lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
+    mask_warnings: list[CaptureWarning] = field(default_factory=list)
+    bits: int | None = None  # of the camera, if 16-bit files seem to have its values without scaling
 
     @property
     def axis_angles_deg(self) -> Doubles:
@@ -69,12 +73,9 @@ class CaptureSummary:
                 f" all {worst.path.name} ({100 * worst.saturated:.1f} %); a shorter exposure gives better normals."
             )
             found.append(CaptureWarning(codes.SATURATED, text))
-        if dark:
-            text = (
-                f"Images that use less than {100 * DARK:.0f} % of the range: {len(dark)}, such as {dark[0].path.name};"
-                " a longer exposure gives less noise."
-            )
-            found.append(CaptureWarning(codes.DARK_IMAGES, text))
+        found += self.mask_warnings
+        if dark and not self.mask_warnings:
+            found.append(self._dark_images(dark))
         if len(self.images) < FEW_LIGHTS:
             text = f"There are {len(self.images)} lights; use {FEW_LIGHTS} or more, well spread."
             found.append(CaptureWarning(codes.FEW_LIGHTS, text))
@@ -84,6 +85,22 @@ class CaptureSummary:
             )
             found.append(CaptureWarning(codes.HIGH_LIGHTS, text))
         return found
+
+    def _dark_images(self, dark: Sequence[ImageSummary]) -> CaptureWarning:
+        level = (1 << self.bits) - 1 if self.bits else 0
+        used = max(image.bright for image in self.images) * _FULL_SCALE / max(level, 1)
+        if level and used >= DARK:
+            text = (
+                f"No value is above {level}, as from a camera of {self.bits} bits in 16-bit files. Of this range, the"
+                f" images use {100 * min(used, 1):.0f} %. If the camera has {self.bits} bits, add --white-level"
+                f" {level}; if it has 16, a longer exposure gives less noise."
+            )
+            return CaptureWarning(codes.WHITE_LEVEL, text)
+        text = f"Images that use less than {100 * DARK:.0f} % of the range: {len(dark)}, such as {dark[0].path.name};"
+        text += " a longer exposure gives less noise"
+        # One dark image among others may have been stored in another way.
+        text += "." if len(dark) > len(self.images) / 2 else ", if the values have as many bits as those of the others."
+        return CaptureWarning(codes.DARK_IMAGES, text)
 
 
 def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) -> CaptureSummary:
@@ -121,7 +138,10 @@ def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) 
         sample, close = (sample_observations(observations, mask, part, taken) for part in parts)
         samples = sample, close
     relative = tuple(_relative_to(level, images[index]) for index in range(len(sizes)))
-    return CaptureSummary(source, relative, n_pixels, level, samples, source.near_lamps(mask)[1])
+    of_mask = source.mask_warnings(mask, fitting)
+    return CaptureSummary(
+        source, relative, n_pixels, level, samples, source.near_lamps(mask)[1], of_mask, saturation.bits
+    )
 
 
 def _summarise(pixels: StoredPixels, size: tuple[int, ...]) -> ImageSummary:

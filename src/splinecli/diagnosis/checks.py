@@ -9,10 +9,11 @@ from splinecli.capture import Capture, CaptureSource
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.capture.restore.light_refinement import would_refine
+from splinecli.capture.robust_fit import fit_robustly
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.diagnosis.evidence import Evidence, gray_intensities
-from splinecli.diagnosis.explanations import check_ground_truth
 from splinecli.diagnosis.frame_evidence import median_turn_deg
+from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck
 from splinecli.diagnosis.light_warnings import light_warnings
 from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
@@ -31,6 +32,11 @@ SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
 _SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
 
+SCALES, SCALE_TOLERANCE = (4, 6, 8), 0.2
+"""The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the brightness of an
+image may differ from them."""
+
+_FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
 _MOST_NAMED = 4  # shifted images in a sentence
 
 Check = Callable[[Evidence], Iterable[CaptureWarning]]
@@ -46,7 +52,31 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
         f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
-    yield CaptureWarning(codes.IMAGES_SHIFTED, text)
+    yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
+
+
+def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
+    """Warn of an image with the values of a camera of fewer bits than the files of the others."""
+    values, lights = np.asarray(seen.observations, np.float64), seen.directions
+    values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may outshine the others
+    predicted = fit_robustly(values, np.ones_like(values), lights, _FITS)[0] @ lights.T
+    lit = predicted > _LIT
+    for place, name in enumerate(seen.names):
+        if np.count_nonzero(lit[:, place]) < _LEAST_PIXELS:
+            continue
+        factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
+        stops = abs(np.log2(max(factor, 1e-6)))
+        bits = min(SCALES, key=lambda bits: abs(bits - stops))
+        if abs(bits - stops) > SCALE_TOLERANCE:
+            continue
+        mended = seen.observations.copy()
+        mended[:, place] /= factor
+        how = f"{1 / factor:.0f} times darker" if factor < 1 else f"{factor:.0f} times brighter"
+        text = (
+            f"{name} is {how} than the other images predict, as if its values had {16 - bits} bits and those of the"
+            f" others 16, or the other way round. Save all images in one way, or scale it by 2^{bits}."
+        )
+        yield CaptureWarning(codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended))
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
@@ -195,7 +225,8 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES, codes.LAMPS_NEAR, codes.CONSTANT_LI
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (same_images, frozenset()),
     (shifted_images, frozenset()),
-    (odd_image, REPEATED),
+    (other_scale, REPEATED),
+    (odd_image, REPEATED | {codes.IMAGE_SCALE}),
     (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), REPEATED),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),

@@ -15,9 +15,11 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.paths import reading
 from splinecli.capture.sample import Sample
+from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.diagnosis.readings import Readings
+from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
 from splinecli.system.files import equal_files
@@ -127,13 +129,50 @@ class Evidence:
 
     @cached_property
     def light_check(self) -> LightCheck:
+        """What the images say about their lights; those that are shifted are moved back."""
+        return self._check_of_moved(self.shifts) if self.shifts else self._check_as_given
+
+    @cached_property
+    def _check_as_given(self) -> LightCheck:
         return check_lights(
             self.observations, self.sample.mask, self.all_directions, self.indices, self.names, self.factors
         )
 
+    def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
+        known, values = moved_back(replace(self.sample, observations=self.observations), self._on_grid(shifts))
+        mask = np.zeros_like(self.sample.mask)
+        mask[self.sample.mask] = known
+        factors = find_factors(values[known], intensities_known=self.intensities_measured)
+        return check_lights(values[known], mask, self.all_directions, self.indices, self.names, factors)
+
+    def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
+        """Return shifts by place, in pixels of the sample."""
+        step = self.sample.step
+        return {shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts}
+
     @cached_property
     def shifts(self) -> list[ImageShift]:
-        return find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+        found = find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+        if self.found:
+            return found
+        step = self.sample.step
+        of_shading = shading_shifts(self.evened, self.directions)
+        shifts = {shift.place: shift for shift in found}
+        shifts |= {place: ImageShift(place, step * right, step * down) for place, (right, down) in of_shading.items()}
+        together = [shifts[place] for place in sorted(shifts)]
+        if not of_shading or self._check_as_given.order is None or self._check_of_moved(together).order is None:
+            return together
+        return found  # the lights are in another order, so they say nothing of shading
+
+    @cached_property
+    def shift_error_deg(self) -> float | None:
+        """The median angle by which shifted images turn the normals; None where too few pixels are left."""
+        if self.found:
+            return None
+        known, values = moved_back(self.evened, self._on_grid(self.shifts))
+        if not known.any():
+            return None
+        return median_turn_deg(self.evened.observations[known], self.directions, self.directions, values[known])
 
 
 def gray_intensities(intensities: Floats) -> Doubles:

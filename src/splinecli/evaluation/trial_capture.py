@@ -17,7 +17,7 @@ from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.sample import sample_observations
 from splinecli.capture.stored import StoredCapture
-from splinecli.diagnosis.explanations import check_ground_truth
+from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trials import Score, Trial

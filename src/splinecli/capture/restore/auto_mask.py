@@ -5,7 +5,24 @@ import numpy as np
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Bools, Singles
 
+LEAST_BORDER, LEAST_HOLE, LEAST_BRIGHT = 0.95, 0.05, 0.5
+"""A mask is probably inverted if it has this share of the picture's border, leaves out this share of the picture, and
+what it leaves out has this share of the brightness of the rest or more. Holes of objects are dark."""
+
 _SMALLEST, _LARGEST = 0.005, 0.98  # smallest and largest share of the picture that an object can cover
+
+
+def surrounds_hole(mask: Bools) -> bool:
+    """Return whether a mask (H, W) has the border of the picture, and leaves out a part of its middle."""
+    border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+    return bool(border.mean() >= LEAST_BORDER and LEAST_HOLE <= 1 - mask.mean() < 1)
+
+
+def looks_inverted(mask: Bools, brightness: Singles) -> bool:
+    """Return whether a mask (H, W) surrounds a hole that is not dark in the picture's brightness (H, W)."""
+    if not surrounds_hole(mask):
+        return False
+    return bool(np.median(brightness[~mask]) > LEAST_BRIGHT * np.median(brightness[mask]))
 
 
 def find_object(brightness: Singles) -> Bools:

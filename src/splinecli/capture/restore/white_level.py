@@ -101,6 +101,19 @@ class Saturation:
         return flags
 
     @property
+    def bits(self) -> int | None:
+        """The bits of a camera whose values look as if they stood in 16-bit files without scaling; None otherwise.
+
+        Scaled values of fewer bits have common divisors.
+        """
+        level = self.white_level
+        if level is None or level.origin != "full scale" or level.value != _FULL_SCALE_16_BIT:
+            return None
+        values = np.concatenate([np.append(image.below, image.maximum) for image in self.images])
+        bits = next((bits for bits in (10, 12, 14) if values.max() < 1 << bits), None)
+        return bits if np.gcd.reduce(values) == 1 else None
+
+    @property
     def n_saturated(self) -> NDArray[np.int64]:
         """The number of saturated observations of each image (F,), among all pixels."""
         return np.array([len(pixels) for pixels in self._decision[1]], np.int64)

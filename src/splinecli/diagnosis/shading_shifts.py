@@ -1,0 +1,249 @@
+"""Images that are shifted against the others, found by their shading and outline where there is no fine detail.
+
+A matte model is fitted to the other images under the given lights. What it leaves of an image is compared with what it
+leaves when the image is moved. The light of the image is free, so a wrong direction or intensity is no shift: on a
+ball, moved shading and a moved lamp differ only near the outline and by the shadow.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from splinecli.capture.robust_fit import fit_robustly
+from splinecli.capture.sample import Sample
+from splinecli.maths.arrays import Bools, Doubles
+from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
+
+REACH, COUNTED = 0.2, 0.75
+"""Shifts are compared up to this share of the smaller side of the object, and count up to that share of it: where a
+model is wrong in another way, the residual often falls on and on."""
+
+LEAST_FALL, MOST_LEFT, MOST_LEFT_OF_FEW = 0.05, 0.5, 0.35
+"""A shift counts if the residual falls by the first, as a share of the image's brightness, and to the second or less of
+what it was: in the whole image, and in most halves of it. With fewer than MANY_IMAGES it is the third: gloss on a
+rendered sphere under eight lights reached 0.4."""
+
+OF_MANY = (0.03, 0.7)
+"""The same two for half of the images, against the other half. Of 202 right captures, none left less than 0.77."""
+
+LEAST_IMAGES, MANY_IMAGES = 8, 10
+LEAST_PIXELS = 300
+
+MOST_RESIDUAL = 0.6  # of the brightness; the model says nothing of metals, which leave more
+_LEAST_KEPT, _LEAST_OVERLAP = 0.3, 0.5
+_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's largest value; a factor of the prediction, and what is added to it
+_WILD = 4.0  # length of scaled normals where the largest value is 1: these are extrapolated from few lit images
+_MOST_VALUES = 300_000  # of pixels and images; beyond, rows and columns are left out
+_PASSES, _FITS = 2, 5
+
+Shift = tuple[int, int]  # right, down
+
+_NO_SHIFT = 0.0, (0, 0)
+
+
+def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift]:
+    """Return the shifts in pixels of the sample of images that are shifted, by place, under lights (F, 3)."""
+    stride = int(np.ceil(np.sqrt(sample.observations.size / _MOST_VALUES)))
+    mask = sample.mask[::stride, ::stride]
+    if len(light_directions) < LEAST_IMAGES or np.count_nonzero(mask) < LEAST_PIXELS:
+        return {}
+    images = np.zeros((len(light_directions), *sample.mask.shape))
+    images[:, sample.mask] = sample.observations.T
+    model = _MatteModel(images[:, ::stride, ::stride], mask, light_directions)
+    n_images = len(images)
+    halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= MANY_IMAGES else ()
+    for half in halves:
+        others = [place for place in range(n_images) if place not in half]
+        fall, shift = _MatteModel(model.images, mask, light_directions, half).find_common(others)
+        if fall > 0:
+            for place in others:
+                model.move(place, shift)
+            break
+    found = [(model.find(place)[0], place) for place in range(n_images) if place not in model.shifts]
+    # An image that was moved back improves the model of the others.
+    order = [place for fall, place in sorted(found, reverse=True) if fall > 0]
+    for place in order * _PASSES:
+        fall, shift = model.find(place)
+        if fall > 0 and shift != model.shifts.get(place):
+            model.move(place, shift)
+    return {place: (stride * right, stride * down) for place, (right, down) in model.shifts.items()}
+
+
+def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Doubles]:
+    """Return which pixels (P,) all images show, moved back by shifts in pixels of the sample, and all values (P, F)."""
+    known, values = np.ones(len(sample.observations), np.bool_), sample.observations.astype(np.float64)
+    image = np.zeros(sample.mask.shape)
+    for place, shift in shifts.items():
+        image[sample.mask] = sample.observations[:, place]
+        values[:, place] = _moved(image, shift)[sample.mask]
+        known &= _moved(sample.mask, shift)[sample.mask] > 0
+    return known, values
+
+
+class _Compared(NamedTuple):
+    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and what they are made of."""
+
+    left: Doubles
+    unmoved: Doubles
+    maps: tuple[Doubles, Doubles, Doubles, Doubles]
+
+
+class _MatteModel:
+    """Scaled normals of images (F, H, W), of which some were moved back by their shifts."""
+
+    def __init__(
+        self, images: Doubles, mask: Bools, light_directions: Doubles, fitted: Sequence[int] | None = None
+    ) -> None:
+        self.images, self.mask, self.lights = images, mask, light_directions
+        self.shifts: dict[int, Shift] = {}
+        self.reach = max(2, round(REACH * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
+        self._values = images[:, mask].T.copy()
+        self._known = np.zeros(self._values.shape, np.bool_)
+        self._known[:, slice(None) if fitted is None else list(fitted)] = True
+        self._fit()
+
+    def move(self, place: int, shift: Shift) -> None:
+        """Move an image back by a shift from where it was photographed, and fit again."""
+        self.shifts[place] = shift
+        self._values[:, place] = _moved(self.images[place], shift)[self.mask]
+        self._known[:, place] = _moved(self.mask, shift)[self.mask]
+        self._fit()
+
+    def _fit(self) -> None:
+        self._top = np.maximum((self._values * self._known).max(axis=1), 1e-12)
+        values = self._values / self._top[:, None]
+        lit = np.where(values > _DARK, 1.0, 1e-3) * np.where(self._known, 1.0, 1e-4)
+        self._normals, self._weights = fit_robustly(values, lit, self.lights, _FITS)
+        self._left = values - self._normals @ self.lights.T
+        x, y, z = self.lights.T
+        products = self._weights @ np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
+        self._covariance = inverse_3x3(tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6)
+
+    def _without(self, place: int) -> Doubles:
+        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are wild."""
+        light, weights = self.lights[place], self._weights[:, place]
+        turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
+        amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
+        normals = self._normals - turn * amount[:, None]
+        return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < _WILD, normals, 0.0)
+
+    def _compared(self, place: int) -> _Compared | None:
+        """Return how the model fits an image at all shifts; None if it says nothing of this image.
+
+        Shadows and highlights of the image are left out; what is dark though the model has it lit is not.
+        """
+        normals, image = self._without(place), self.images[place][self.mask]
+        predicted, values = np.maximum(normals @ self.lights[place], 0), image / self._top
+        shadow = (values < _DARK) & (predicted < 2 * _DARK)
+        kept = ~shadow & (values <= _HIGHLIGHT[0] * predicted + _HIGHLIGHT[1])
+        if kept.mean() < _LEAST_KEPT:
+            return None
+        good, scaled = self._map(np.asarray(normals.any(axis=1))), self._map(normals * self._top[:, None])
+        kept, image = self._map(kept), self._map(image * kept)
+        products = np.stack([scaled[row] * scaled[column] for row in range(3) for column in range(3)])
+        overlap = self._sums(good, kept)
+        left = _residual(overlap, self._sums(products, kept), self._sums(scaled, image), self._sums(good, image**2))
+        unmoved = _residual(  # in the pixels that the moved image covers
+            self._sums(good * kept, self.mask),
+            self._sums(products * kept, self.mask),
+            self._sums(scaled * image, self.mask),
+            self._sums(good * image**2, self.mask),
+        )
+        brightness = max(float(np.sqrt((image**2).sum() / kept.sum())), 1e-12)
+        enough = overlap > _LEAST_OVERLAP * overlap.max()
+        left, unmoved = (np.where(enough, values / brightness, np.inf) for values in (left, unmoved))
+        return _Compared(left, unmoved, (scaled, good, kept, image))
+
+    def find(self, place: int) -> tuple[float, Shift]:
+        """Return the shift at which the model leaves least of an image, and by how much less; 0 if it does not count."""
+        compared = self._compared(place)
+        if compared is None:
+            return _NO_SHIFT
+        most_left = MOST_LEFT if len(self.images) >= MANY_IMAGES else MOST_LEFT_OF_FEW
+        fall, shift = _least(compared.left, compared.unmoved, LEAST_FALL, most_left)
+        return (fall, shift) if fall and self._left_in_halves(*compared.maps, shift) <= MOST_LEFT else _NO_SHIFT
+
+    def find_common(self, places: Sequence[int]) -> tuple[float, Shift]:
+        """Return the same for images that may all have the same shift."""
+        found = [compared for compared in map(self._compared, places) if compared is not None]
+        if len(found) < len(places) / 2:
+            return _NO_SHIFT
+        left, unmoved = (np.mean([each[part] for each in found], axis=0) for part in (0, 1))
+        return _least(left, unmoved, *OF_MANY)
+
+    def _left_in_halves(self, scaled: Doubles, good: Doubles, kept: Doubles, image: Doubles, shift: Shift) -> float:
+        """Return the median share that a shift leaves in the upper, lower, left and right half.
+
+        Gloss looks shifted on the side of the highlight alone.
+        """
+
+        def residuals(image: Doubles, kept: Doubles) -> Doubles:
+            inside = (kept * good) > 0
+            light = np.linalg.lstsq(scaled[:, inside].T, image[inside], rcond=None)[0]
+            return np.where(inside, np.abs(image - np.tensordot(light, scaled, 1)), np.nan)
+
+        after = residuals(_moved(image, shift), _moved(kept, shift))
+        before = residuals(image, kept * _moved(self.mask, shift))
+        largest = 3 * np.nanmean(before)
+        shares = []
+        for places, middle in zip(np.indices(image.shape), map(np.median, np.nonzero(self.mask)), strict=True):
+            for half in (places <= middle, places > middle):
+                found = [each[half & ~np.isnan(each)].clip(max=largest) for each in (after, before)]
+                if all(map(len, found)):
+                    shares.append(found[0].mean() / max(found[1].mean(), 1e-12))
+        return float(np.median(shares)) if shares else np.inf
+
+    def _map(self, values: Doubles | Bools) -> Doubles:
+        """Return values (P,) or (P, K) on a map (H, W) or (K, H, W), zero outside the mask."""
+        array = np.zeros((*values.shape[1:], *self.mask.shape))
+        array[..., self.mask] = values.T
+        return array
+
+    def _sums(self, first: Doubles, second: Doubles | Bools) -> Doubles:
+        """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right) within reach."""
+        from scipy.fft import irfft2, next_fast_len, rfft2
+
+        shape = [next_fast_len(side + self.reach, real=True) for side in self.mask.shape]
+        sums = irfft2(np.conj(rfft2(first, shape)) * rfft2(second, shape), shape)
+        around = np.arange(-self.reach, self.reach + 1)
+        return np.asarray(sums[..., around[:, None], around])
+
+
+def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float) -> tuple[float, Shift]:
+    """Return by how much the residuals at shifts (h, w) fall from those of the unmoved image, and where most."""
+    fall = np.where(np.isfinite(left), unmoved, 0.0) - np.where(np.isfinite(left), left, 0.0)
+    row, column = np.unravel_index(int(fall.argmax()), fall.shape)
+    reach = len(left) // 2
+    shift = int(column) - reach, int(row) - reach
+    before, after = float(unmoved[row, column]), float(left[row, column])
+    near = 0 < max(map(abs, shift)) <= COUNTED * reach
+    counts = near and before - after >= least_fall and after <= most_left * before
+    return (before - after, shift) if counts and before <= MOST_RESIDUAL else _NO_SHIFT
+
+
+def _residual(count: Doubles, products: Doubles, sums: Doubles, squares: Doubles) -> Doubles:
+    """Return root mean square residuals at each shift (h, w) of a fit with the best light.
+
+    From the sums over pixels of scaled normals times each other (9, h, w), and of images times these (3, h, w).
+    """
+    matrices = np.moveaxis(products.reshape(3, 3, *count.shape), (0, 1), (-2, -1))
+    trace = np.trace(matrices, axis1=-2, axis2=-1)
+    matrices = matrices + (1e-6 * trace + 1e-12)[..., None, None] * np.eye(3)
+    sides = np.moveaxis(sums, 0, -1)
+    explained = (sides * np.linalg.solve(matrices, sides[..., None])[..., 0]).sum(axis=-1)
+    return np.asarray(np.sqrt(np.maximum(squares - explained, 0) / np.maximum(count, 1)))
+
+
+def _moved(image: Doubles | Bools, shift: Shift) -> Doubles:
+    """Return image(x + shift) on the same map; zero where this lies outside."""
+    moved = np.zeros(image.shape)
+    to, source = (
+        tuple(
+            slice(max(0, by * sign), min(side, side + by * sign))
+            for by, side in zip(shift[::-1], image.shape, strict=True)
+        )
+        for sign in (-1, 1)
+    )
+    moved[to] = image[source]
+    return moved
