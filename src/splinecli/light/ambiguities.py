@@ -77,7 +77,7 @@ def _cast_shadows(heights: Doubles, mask: Bools, light_directions: Doubles) -> B
     shadows = np.zeros((len(own), len(light_directions)), np.bool_)
     for light, (x, y, z) in enumerate(light_directions):
         across = max(float(np.hypot(x, y)), 1e-6)
-        for step in _STEPS[_STEPS <= max(mask.shape)]:
+        for step in _STEPS[max(mask.shape) >= _STEPS]:
             row = np.clip(np.rint(rows - step * y / across).astype(int), -1, mask.shape[0])
             column = np.clip(np.rint(columns + step * x / across).astype(int), -1, mask.shape[1])
             shadows[:, light] |= surface[row + 1, column + 1] - own - step * z / across > _CLEARANCE
