@@ -29,7 +29,7 @@ def estimate_normals(
     mask: ArrayLike | None = None,
     *,
     light_intensities: ArrayLike | None = None,
-    first_light: Literal["left", "right", "above", "below"] | None = None,
+    first_light: str | float | None = None,
     pixel_size: float | None = None,
     method: str = "spline-net",
     as_stored: bool = False,
@@ -60,8 +60,9 @@ def estimate_normals(
             None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
             that they differ.
-        first_light: where light_directions is None, the side of the image from which the first light comes. It is
-            needed for an object without outline.
+        first_light: where light_directions is None, the side of the image from which the first light comes, such as
+            "left" or "upper-left", or its azimuth in degrees, counter-clockwise from the right. It is needed for an
+            object without outline.
         pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
             lamps in the same unit, from the middle of the image on the object's mean plane.
         method: "spline-net", "spline-net-pixelwise", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
@@ -113,7 +114,7 @@ def estimate_normals(
     if light_directions is None:
         from splinecli.light.unknown_lights import find_lights
 
-        find = partial(find_lights, first_light=first_light)
+        find = partial(find_lights, first_light=None if first_light is None else str(first_light))
     capture = capture_from_arrays(
         images,
         light_directions,

@@ -117,12 +117,14 @@ def test_first_light(unlit, run):
     for command in (crop, ("info", unlit, "--crop", "16,16,32,32", "--lights", "estimate")):
         result = run(*command)
         assert result.code == 3 and result.err.startswith("splinecli: ball: the images do not show the outline")
-    assert "--first-light left, right, above or below" in result.err
-    side = "left" if LIGHTS[0, 0] < 0 else "right"
+    assert "--auto-mask" in result.err and "--first-light left, upper-left, or its azimuth" in result.err
+    side = str(np.degrees(np.arctan2(LIGHTS[0, 1], LIGHTS[0, 0])))
     assert run(*crop, "--first-light", side).code == 0
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
     result = run("infer", unlit, "--first-light", side)
     assert result.code == 2 and "--first-light needs --lights estimate" in result.err
+    result = run(*crop, "--first-light", "north")
+    assert result.code == 2 and "the first light comes from 'north'; expected one of right," in result.err
 
 
 @pytest.mark.parametrize(

@@ -103,10 +103,21 @@ def test_what_shows_no_object_is_refused() -> None:
 def test_a_first_light_from_another_side_decides_nothing() -> None:
     true = lights()
     true[0] = (0.0, 0.6, 0.8)
-    with pytest.raises(InputError, match="does not come clearly from left"):
+    with pytest.raises(InputError, match=r"does not come clearly from left.* --first-light 45"):
         find_lights(observed(true), INSIDE, True, first_light="left")
     found = find_lights(observed(true), INSIDE, True, first_light="above")
     assert mean_angle(found.directions, true) < 5
+
+
+@pytest.mark.parametrize(("side", "azimuth_deg"), [("upper-right", 45), ("90", 90), ("lower-left", 225), ("-45", 315)])
+def test_the_first_light_may_come_from_any_direction(side: str, azimuth_deg: float) -> None:
+    true = lights()
+    azimuth = np.radians(azimuth_deg)
+    true[0] = (0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), 0.8)
+    found = find_lights(observed(true), INSIDE, True, first_light=side)
+    assert mean_angle(found.directions, true) < 5
+    with pytest.raises(UsageError, match=r"expected one of right, upper-right, .* or its azimuth in degrees"):
+        find_lights(observed(true), INSIDE, True, first_light=side + "x")
 
 
 def test_holes_and_narrow_borders_are_no_outline() -> None:
@@ -125,7 +136,7 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow:
     true[0] = (-0.6, 0.0, 0.8)
     normals = sphere_cap(SIZE).reshape(-1, 3) * ((-1, -1, 1) if hollow else (1, 1, 1))
     images = shade(normals, true, noise=0.002).astype(np.float32)
-    with pytest.raises(InputError, match=r"a bump looks like a hollow .* --first-light left"):
+    with pytest.raises(InputError, match=r"a bump looks like a hollow .* add --auto-mask\. .* --first-light left"):
         find_lights(images, everywhere, True)
     found = find_lights(images, everywhere, True, first_light="left")
     assert mean_angle(found.directions, true) < 6
@@ -184,7 +195,8 @@ def test_python() -> None:
     for lights_given, options, message in (
         (None, {"pixel_size": 1.0}, "near lamps need positions"),
         (true, {"first_light": "left"}, "first_light is for lights that are found"),
-        (None, {"first_light": "north"}, "first light"),
+        (None, {"first_light": "north"}, "first light comes from 'north'"),
+        (None, {"first_light": 400}, "first light comes from '400'"),
     ):
         with pytest.raises(UsageError, match=message):
             estimate_normals(images, lights_given, INSIDE, **options)

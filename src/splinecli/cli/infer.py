@@ -30,7 +30,7 @@ def infer(
         ..., metavar="CAPTURE", help="Folders with the images of one object each, or films."
     ),
     lights: Path | None = shared.LIGHTS,
-    first_light: shared.FirstLight | None = shared.FIRST_LIGHT,
+    first_light: str | None = shared.FIRST_LIGHT,
     intensities: Path | None = shared.INTENSITIES,
     refine_lights: bool = shared.REFINE_LIGHTS,
     light_positions: Path | None = shared.LIGHT_POSITIONS,

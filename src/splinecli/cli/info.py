@@ -13,7 +13,7 @@ from splinecli.errors import InputError
 def info(
     capture: Path = Argument(..., metavar="CAPTURE", help="Folder with the images of one object, or a film."),
     lights: Path | None = shared.LIGHTS,
-    first_light: shared.FirstLight | None = shared.FIRST_LIGHT,
+    first_light: str | None = shared.FIRST_LIGHT,
     intensities: Path | None = shared.INTENSITIES,
     light_positions: Path | None = shared.LIGHT_POSITIONS,
     light_distance: float | None = shared.LIGHT_DISTANCE,

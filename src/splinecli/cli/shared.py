@@ -30,10 +30,16 @@ _MOST_DIGITS = 18  # of a number of images
 
 # Each is a type of Typer: the values that an option may have.
 Device = StrEnum("Device", ["auto", "cpu", "cuda"])
-FirstLight = StrEnum("FirstLight", ["left", "right", "above", "below"])
 LightForm = StrEnum("LightForm", {"xyz": "xyz", "azel": "azel", "slant_tilt": "slant-tilt"})
 NormalConvention = StrEnum("NormalConvention", ["opengl", "directx"])
 Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
+
+
+def complete_sides() -> list[str]:
+    """Return the sides that a first light may come from."""
+    from splinecli.capture.lights.found_lights import SIDES_DEG
+
+    return [*SIDES_DEG]
 
 
 def complete_curves() -> list[str]:
@@ -180,8 +186,10 @@ LIGHTS = Option(
 )
 FIRST_LIGHT = Option(
     None,
-    help="With --lights estimate: side from which the light of the first image that is used comes. Objects without"
-    " outline need it.",
+    metavar="SIDE|DEGREES",
+    help="With --lights estimate: where the light of the first image that is used comes from, as left, above,"
+    " upper-left or its azimuth, counter-clockwise from the right. Objects without outline need it.",
+    autocompletion=complete_sides,
 )
 LIGHT_FRAME = Option(
     None,

@@ -37,6 +37,11 @@ class OutlineTurn(NamedTuple):
     # the median of what remains of the z of these normals; small where the outline is that of a smooth surface
     spread: float
 
+    @property
+    def angle_deg(self) -> float:
+        """The angle of the rotation."""
+        return float(np.degrees(np.linalg.norm(self.rotation)))
+
     def share(self, part: float) -> Array:
         """Return a part of the rotation (3, 3), from 0 to 1."""
         from scipy.spatial.transform import Rotation

@@ -13,7 +13,7 @@ from splinecli.capture import CaptureSource, RadiometricCalibration, open_captur
 from splinecli.capture.layouts.capture_files import check_not_empty, list_images
 from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.capture.lights.draws import check_draw_settings
-from splinecli.capture.lights.found_lights import ESTIMATE, FirstLight, LightFinder
+from splinecli.capture.lights.found_lights import ESTIMATE, LightFinder, azimuth_of
 from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.lights.light_rows import LightForm
@@ -41,7 +41,7 @@ class Reading:
     """
 
     lights: str | None = None
-    first_light: FirstLight | None = None
+    first_light: str | None = None
     intensities: str | None = None
     light_positions: str | None = None
     light_distance: float | None = None
@@ -78,7 +78,7 @@ class Reading:
         if self.first_light is not None and not self.finds_lights:
             raise UsageError("--first-light needs --lights estimate", hint="Add it, or leave both out")
         if self.first_light is not None:
-            check_one_of("first light", self.first_light, get_args(FirstLight))
+            azimuth_of(self.first_light)
         _ = self.lamps, parse_window(self.crop, self.scale)
         parse_transfer(self.transfer)
         parse_light_frame(self.light_frame)
