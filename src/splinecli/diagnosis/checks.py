@@ -30,6 +30,10 @@ SAME_IMAGE = 1e-12
 
 SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
+DECISIVE = 0.35
+"""Largest ratio of residuals from which another reading shows that the lights are right: in a wrong order or frame, none
+leaves so little. Intensities are an exception, since on flat objects they explain any order."""
+
 _SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
 
 SCALES, SCALE_TOLERANCE = (4, 6, 8), 0.2
@@ -152,8 +156,11 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
 
-def other_readings(seen: Evidence) -> list[CaptureWarning]:
-    """Warn of images that fit much better if they are read in another way; see readings.py."""
+def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWarning]:
+    """Warn of images that fit much better if they are read in another way; see readings.py.
+
+    Readings that leave more than the largest ratio of the residual are not named.
+    """
     kinds: set[Kind] = {"offset", "intensities"}
     if seen.linear:
         kinds.add("curve")
@@ -164,6 +171,8 @@ def other_readings(seen: Evidence) -> list[CaptureWarning]:
     if likeliest is None or likeliest[1] < LIKELY:
         return []
     reading, _ = likeliest
+    if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
+        return []
     if reading.kind == "intensities" and seen.estimated is not None:
         return []  # they are divided out
     error_deg = readings.error_deg(reading, seen.estimated)
@@ -220,18 +229,28 @@ DOUBTED = REPEATED | {
 }  # fmt: skip
 """After these warnings, nothing that relies on the lights can be told."""
 
-EXPLAINED = DOUBTED | {codes.ENCODED_VALUES, codes.LAMPS_NEAR, codes.CONSTANT_LIGHT}
+READ_OTHERWISE = frozenset({codes.ENCODED_VALUES, codes.LAMPS_NEAR, codes.CONSTANT_LIGHT})
+"""After these warnings, the normals tell nothing of the lights' frame, and the images nothing of their order."""
+
+EXPLAINED = DOUBTED | READ_OTHERWISE
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (same_images, frozenset()),
     (shifted_images, frozenset()),
     (other_scale, REPEATED),
     (odd_image, REPEATED | {codes.IMAGE_SCALE}),
-    (lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict), REPEATED),
+    (
+        lambda seen: other_readings(seen, DECISIVE),
+        REPEATED | {codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.IMAGE_SCALE},
+    ),
+    (
+        lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict),
+        REPEATED | READ_OTHERWISE,
+    ),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
-    (other_readings, DOUBTED),
+    (other_readings, DOUBTED | READ_OTHERWISE),
     (rough_lights, EXPLAINED),
 )
 """The checks, and the codes of earlier warnings after which each is skipped."""
