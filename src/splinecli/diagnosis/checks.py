@@ -31,8 +31,8 @@ SAME_IMAGE = 1e-12
 SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
 DECISIVE = 0.35
-"""Largest ratio of residuals from which another reading shows that the lights are right: in a wrong order or frame, none
-leaves so little. Intensities are an exception, since on flat objects they explain any order."""
+"""Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
+ones, none leaves so little. Intensities are an exception, since on flat objects they explain any order."""
 
 _SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
 
@@ -167,7 +167,7 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
     if not seen.has_positions:
         kinds.add("near")
     readings = seen.readings
-    likeliest = readings.likeliest(kinds, eight_bit=seen.eight_bit)
+    likeliest = readings.likeliest(kinds)
     if likeliest is None or likeliest[1] < LIKELY:
         return []
     reading, _ = likeliest
@@ -236,7 +236,8 @@ EXPLAINED = DOUBTED | READ_OTHERWISE
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (same_images, frozenset()),
-    (shifted_images, frozenset()),
+    (lambda seen: other_readings(seen, DECISIVE), REPEATED),
+    (shifted_images, READ_OTHERWISE),
     (other_scale, REPEATED),
     (odd_image, REPEATED | {codes.IMAGE_SCALE}),
     (

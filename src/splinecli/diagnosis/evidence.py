@@ -125,7 +125,8 @@ class Evidence:
     def readings(self) -> Readings:
         """The sample as the files store it, to be read in other ways."""
         observations = self.observations if self.intensities is None else self.observations * self.intensities
-        return Readings(replace(self.sample, observations=observations), self.directions, self.intensities)
+        sample = replace(self.sample, observations=observations)
+        return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
 
     @cached_property
     def light_check(self) -> LightCheck:

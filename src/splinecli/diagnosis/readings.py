@@ -69,19 +69,10 @@ class Reading:
 
     kind: Kind
     amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
-    residual: float  # as a share of the pixels' largest values
     ratio: float  # residual over that of the given reading, on the same observations
+    evidence: float  # logarithm of its probability over that of the given reading
     normals: Doubles  # (p, 3), scaled, at the chosen pixels
     intensities: Doubles  # (F,), mean 1; ones unless they are free
-    cost: float = 0.0  # what the reading loses beside COSTS
-
-    def evidence(self, *, eight_bit: bool = False) -> float:
-        """Return the logarithm of the probability over that of the given reading."""
-        cost = COSTS[self.kind] + self.cost - (EIGHT_BIT if eight_bit and self.kind == "curve" else 0)
-        if self.kind == "intensities":
-            spread = float(np.std(np.log(self.intensities)))
-            cost += EQUAL_COST * np.exp(-((spread / EQUAL_SPREAD) ** 2))
-        return -cost - POWERS[self.kind] * float(np.log(self.ratio))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +89,12 @@ class Readings:
         sample: its observations are as stored, not divided by intensities.
         lights: (F, 3), unit.
         intensities: (F,), those that were measured; None for equal ones.
+        eight_bit: whether the images have 8 bits and do not say that they are linear.
     """
 
-    def __init__(self, sample: Sample, lights: Doubles, intensities: Doubles | None = None) -> None:
+    def __init__(
+        self, sample: Sample, lights: Doubles, intensities: Doubles | None = None, *, eight_bit: bool = False
+    ) -> None:
         n_lights = len(lights)
         chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
         values = values.clip(min=0)
@@ -109,7 +103,7 @@ class Readings:
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
-        self.shape = sample.mask.shape
+        self.shape, self.eight_bit = sample.mask.shape, eight_bit
         self.are_enough = n_lights >= _MIN_LIGHTS and len(self.values) >= _MIN_PIXELS
 
     def fit(self, kinds: Collection[Kind]) -> list[Reading]:
@@ -118,34 +112,37 @@ class Readings:
             return []
         kinds = [kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]]
         vectors = self._with(self.lights)
-        given = _fit(self.values, vectors)
-        found = []
-        if "curve" in kinds:
-            found.append(self._best_curve(free=False))
-        if "near" in kinds:
-            found.append(self._best_near())
+        given, found = _fit(self.values, vectors), list[Reading]()
         if "offset" in kinds:
             found.append(_best("offset", self._offset_fits(vectors), given))
+        if "curve" in kinds:
+            found.append(self._best_curve())
+        if not {"near", "intensities"}.isdisjoint(kinds):
+            free = _fit(self.values, vectors, free=True)
+        if "near" in kinds:
+            found.append(self._best_near(free))
         if "intensities" in kinds:
-            found.append(_best("intensities", {1.0: _fit(self.values, vectors, free=True)}, given))
+            unequal = _best("intensities", {1.0: free}, given, _cost_of_equal(free.intensities))
+            found.append(unequal)
+            if "curve" in kinds:  # unequal lamps may hide a curve
+                curve = self._best_curve(free=True)
+                of_lamps = -COSTS["intensities"] - POWERS["intensities"] * np.log(unequal.ratio)
+                evidence = curve.evidence + of_lamps - _cost_of_equal(curve.intensities)
+                found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=float(evidence)))
         return found
 
-    def likeliest(self, kinds: Collection[Kind], *, eight_bit: bool = False) -> tuple[Reading, float] | None:
+    def likeliest(self, kinds: Collection[Kind]) -> tuple[Reading, float] | None:
         """Return the reading of these kinds that fits best, and its probability; None if nothing can be said."""
         found = self.fit(kinds)
         if not found:
             return None
-        evidence = np.array([0.0, *(reading.evidence(eight_bit=eight_bit) for reading in found)])
-        shares = np.exp(evidence - np.logaddexp.reduce(evidence))
-        first = int(np.argmax(shares[1:]))
-        best, probability = found[first], float(shares[1 + first])
-        if best.kind == "intensities" and "curve" in kinds and probability > LIKELY:
-            # Unequal lamps may hide a curve.
-            curve = self._best_curve(free=True)
-            share = float(1 / (1 + np.exp(-curve.evidence(eight_bit=eight_bit))))
-            if share > LIKELY:
-                return curve, share * probability
-        return best, probability
+        evidence = np.array([reading.evidence for reading in found])
+        probabilities = np.exp(evidence - np.logaddexp.reduce([0.0, *evidence]))
+        first = int(np.argmax(probabilities))
+        same_kind = [
+            share for reading, share in zip(found, probabilities, strict=True) if reading.kind == found[first].kind
+        ]
+        return found[first], float(sum(same_kind))
 
     def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
         """Return the median angle in degrees between the normals of a reading and those of the given one.
@@ -156,19 +153,20 @@ class Readings:
         given = _fit(self.values, self._with(lights))
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
-    def _best_curve(self, *, free: bool) -> Reading:
+    def _best_curve(self, *, free: bool = False) -> Reading:
         vectors, shadow = self._with(self.lights), _ENCODED_SHADOW
         given = _fit(self.values, vectors, free=free, shadow=shadow)
         fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in EXPONENTS}
-        return _best("curve", fits, given)
+        return _best("curve", fits, given, -EIGHT_BIT if self.eight_bit else 0.0)
 
-    def _best_near(self) -> Reading:
-        """Return the best distance. Intensities are free: near lamps look unequal, and lamps that are may be near."""
-        given = _fit(self.values, self._with(self.lights), free=True)
+    def _best_near(self, given: _Fit) -> Reading:
+        """Return the best distance. Intensities are free: near lamps look unequal, and unequal lamps may be near."""
         fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
         best = _best("near", fits, given)
-        round_cost = ROUND_COST if _roundness(best.normals, np.stack((self.columns, -self.rows), axis=1)) > ROUND else 0
-        return replace(best, cost=round_cost + (END_COST if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0))
+        places = np.stack((self.columns, -self.rows), axis=1)
+        cost = ROUND_COST if _roundness(best.normals, places) > ROUND else 0.0
+        cost += END_COST if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0.0
+        return replace(best, evidence=best.evidence - cost)
 
     def _offset_fits(self, vectors: Doubles) -> dict[float, _Fit]:
         """Return fits with constant light, also between the two of OFFSETS around the best one."""
@@ -190,11 +188,17 @@ class Readings:
         return lights if self.intensities is None else lights * self.intensities[:, None]
 
 
-def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit) -> Reading:
+def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
+    """Return the best of some fits by their amounts, which has this cost beside that of its kind."""
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
     ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
-    return Reading(kind, amount, found.residual, ratio, found.normals, found.intensities)
+    evidence = -COSTS[kind] - cost - POWERS[kind] * np.log(ratio)
+    return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
+
+
+def _cost_of_equal(intensities: Doubles) -> float:
+    return float(EQUAL_COST * np.exp(-((np.std(np.log(intensities)) / EQUAL_SPREAD) ** 2)))
 
 
 def _fit(
