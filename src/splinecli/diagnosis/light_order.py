@@ -77,7 +77,7 @@ change of the albedo, lights are half vectors, if the logarithm of that change h
 Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors, below 0.4 with right lights
 and below 0.5 with near lamps."""
 
-LOWEST_DOUBLED = -0.1  # z of a doubled direction; half vectors of lights above the horizon are within 45 degrees
+LOWEST_DOUBLED = 0.0  # z of a doubled direction; half vectors of lights above the horizon are within 45 degrees
 
 RANDOM_FIT = 0.7
 """Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
@@ -165,7 +165,9 @@ def check_order(
             tried.append(rings)
             if rings.misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
                 found = rings
-    if found is given and _is_wrong(observations, compared, given, random):
+    # On glossy plates, intensities that may be any hide an order that fits well under the known ones.
+    fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
+    if found is given and not fits_known and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
     turns: tuple[Turn, ...] = ()
     if any(found is shift for shift in shifts) or (found is given and share < MIN_MISFIT):
