@@ -12,7 +12,8 @@ from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.capture.restore.light_refinement import fit_near
 from splinecli.confidence import add_common_error
 from splinecli.errors import InputError, UsageError
-from splinecli.light.outline import outline_share, turn_at_outline
+from splinecli.light import unknown_lights
+from splinecli.light.outline import OutlineTurn, outline_share, turn_at_outline
 from splinecli.light.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg
 
@@ -200,3 +201,15 @@ def test_python() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             estimate_normals(images, lights_given, INSIDE, **options)
+
+
+def test_the_outline_turns_the_lights_no_further_than_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The far rim of a vessel's mouth is not turned outwards, and a turn that makes it so is wrong."""
+    true = lights()
+    found = {}
+    for angle in (0.2, 2.5):
+        monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: (true, np.full(10, 4.0), np.ones(10)))
+        turn = OutlineTurn(np.array((angle, 0.0, 0.0)), 0.1)
+        monkeypatch.setattr(unknown_lights, "turn_at_outline", lambda *_, turn=turn: turn)
+        found[angle] = mean_angle(find_lights(observed(true), INSIDE, True).directions, true)
+    assert found[2.5] < 4 and found[0.2] < 4

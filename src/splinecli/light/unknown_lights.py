@@ -40,7 +40,7 @@ SAME_IMAGES = 0.01  # images that differ by less from their mean, as a share of 
 _WORTH_PIXELS = 6.0  # see fit_near
 _CLEAR_OUTLINE = 0.2  # largest spread of an outline that counts
 _OUTLINE_SHARE = 0.35  # of the turn that it shows
-_LARGEST_TURN = 2.0  # times the expected error; larger ones come from the mouth of a vessel
+_LARGEST_TURN = 2.0  # times the expected error; what a larger turn has beyond it comes from the mouth of a vessel
 # Log odds that the network takes a bump for a bump: fewer where it expects larger errors.
 _MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
 # The mean error of what is returned from that which the network expects, on 720 rendered captures with and without an
@@ -108,8 +108,9 @@ def find_lights(
         directions = directions * (-1, -1, 1) if log_odds < 0 else directions
         opposite_share = 1 / (1 + math.exp(abs(log_odds)))
     turn = turn_at_outline(observations, mask, directions)
-    if turn is not None and turn.spread < _CLEAR_OUTLINE and turn.angle_deg < _LARGEST_TURN * expected_deg:
-        turned = directions @ turn.share(_OUTLINE_SHARE).T
+    if turn is not None and turn.spread < _CLEAR_OUTLINE:
+        share = _OUTLINE_SHARE * min(1, _LARGEST_TURN * expected_deg / max(turn.angle_deg, 1e-9))
+        turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
     found_deg = _ERROR_SCALE * expected_deg**_ERROR_POWER if outlined else _ERROR_SHARE * expected_deg
