@@ -27,14 +27,18 @@ rendered sphere under eight lights reached 0.4."""
 OF_MANY = (0.03, 0.7)
 """The same two for half of the images, against the other half. Of 202 right captures, none left less than 0.77."""
 
+OUTSTANDING = 2.0
+"""The residual of a shifted image is so many times that of the better images, of which a quarter have less. Where the
+model fits no image well, as on polished balls, it does not say which is shifted."""
+
 LEAST_IMAGES, MANY_IMAGES = 8, 10
 LEAST_PIXELS = 300
 
 MOST_RESIDUAL = 0.6  # of the brightness; the model says nothing of metals, which leave more
 _LEAST_KEPT, _LEAST_OVERLAP = 0.3, 0.5
-_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's largest value; a factor of the prediction, and what is added to it
-_WILD = 4.0  # length of scaled normals where the largest value is 1: these are extrapolated from few lit images
-_MOST_VALUES = 300_000  # of pixels and images; beyond, rows and columns are left out
+_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and what is added to it
+_WILD = 4.0  # length of scaled normals where a bright value is 1: these are extrapolated from few lit images
+_MOST_VALUES = 200_000  # of pixels and images; beyond, rows and columns are left out
 _PASSES, _FITS = 2, 5
 
 Shift = tuple[int, int]  # right, down
@@ -53,18 +57,20 @@ def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift
     model = _MatteModel(images[:, ::stride, ::stride], mask, light_directions)
     n_images = len(images)
     halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= MANY_IMAGES else ()
+    together = []
     for half in halves:
         others = [place for place in range(n_images) if place not in half]
-        fall, shift = _MatteModel(model.images, mask, light_directions, half).find_common(others)
-        if fall > 0:
-            for place in others:
-                model.move(place, shift)
-            break
-    found = [(model.find(place)[0], place) for place in range(n_images) if place not in model.shifts]
+        of_half = _MatteModel(model.images, mask, light_directions, half)
+        together.append((*of_half.find_common(others, of_half.usual_residual(half)), others))
+    fall, shift, others = max(together, default=(0.0, (0, 0), []))
+    for place in others if fall > 0 else ():
+        model.move(place, shift)
+    usual = model.usual_residual(range(n_images))
+    found = [(model.find(place, usual)[0], place) for place in range(n_images) if place not in model.shifts]
     # An image that was moved back improves the model of the others.
     order = [place for fall, place in sorted(found, reverse=True) if fall > 0]
     for place in order * _PASSES:
-        fall, shift = model.find(place)
+        fall, shift = model.find(place, usual)
         if fall > 0 and shift != model.shifts.get(place):
             model.move(place, shift)
     return {place: (stride * right, stride * down) for place, (right, down) in model.shifts.items()}
@@ -111,7 +117,9 @@ class _MatteModel:
         self._fit()
 
     def _fit(self) -> None:
-        self._top = np.maximum((self._values * self._known).max(axis=1), 1e-12)
+        known = self._values * self._known
+        bright = int(self._known.any(axis=0).sum()) // 8  # highlights: the brightest eighth of the images
+        self._top = np.maximum(np.partition(known, -1 - bright, axis=1)[:, -1 - bright], 1e-12)
         values = self._values / self._top[:, None]
         lit = np.where(values > _DARK, 1.0, 1e-3) * np.where(self._known, 1.0, 1e-4)
         self._normals, self._weights = fit_robustly(values, lit, self.lights, _FITS)
@@ -155,22 +163,28 @@ class _MatteModel:
         left, unmoved = (np.where(enough, values / brightness, np.inf) for values in (left, unmoved))
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
-    def find(self, place: int) -> tuple[float, Shift]:
-        """Return the shift at which the model leaves least of an image, and by how much less; 0 if it does not count."""
+    def usual_residual(self, places: Sequence[int]) -> float:
+        """Return the residual that a quarter of some images are below, where they are."""
+        found = [compared for compared in map(self._compared, places) if compared is not None]
+        still = [compared.left[self.reach, self.reach] for compared in found]
+        return float(np.quantile(still, 0.25)) if still else np.inf
+
+    def find(self, place: int, usual: float) -> tuple[float, Shift]:
+        """Return the shift that leaves least of an image, and by how much less; 0 if it does not count."""
         compared = self._compared(place)
         if compared is None:
             return _NO_SHIFT
         most_left = MOST_LEFT if len(self.images) >= MANY_IMAGES else MOST_LEFT_OF_FEW
-        fall, shift = _least(compared.left, compared.unmoved, LEAST_FALL, most_left)
+        fall, shift = _least(compared.left, compared.unmoved, LEAST_FALL, most_left, usual)
         return (fall, shift) if fall and self._left_in_halves(*compared.maps, shift) <= MOST_LEFT else _NO_SHIFT
 
-    def find_common(self, places: Sequence[int]) -> tuple[float, Shift]:
+    def find_common(self, places: Sequence[int], usual: float) -> tuple[float, Shift]:
         """Return the same for images that may all have the same shift."""
         found = [compared for compared in map(self._compared, places) if compared is not None]
         if len(found) < len(places) / 2:
             return _NO_SHIFT
         left, unmoved = (np.mean([each[part] for each in found], axis=0) for part in (0, 1))
-        return _least(left, unmoved, *OF_MANY)
+        return _least(left, unmoved, *OF_MANY, usual)
 
     def _left_in_halves(self, scaled: Doubles, good: Doubles, kept: Doubles, image: Doubles, shift: Shift) -> float:
         """Return the median share that a shift leaves in the upper, lower, left and right half.
@@ -210,16 +224,19 @@ class _MatteModel:
         return np.asarray(sums[..., around[:, None], around])
 
 
-def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float) -> tuple[float, Shift]:
-    """Return by how much the residuals at shifts (h, w) fall from those of the unmoved image, and where most."""
-    fall = np.where(np.isfinite(left), unmoved, 0.0) - np.where(np.isfinite(left), left, 0.0)
-    row, column = np.unravel_index(int(fall.argmax()), fall.shape)
+def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float, usual: float) -> tuple[float, Shift]:
+    """Return by how much the residual falls at the shift that leaves the smallest share of it; residuals are (h, w)."""
     reach = len(left) // 2
-    shift = int(column) - reach, int(row) - reach
-    before, after = float(unmoved[row, column]), float(left[row, column])
-    near = 0 < max(map(abs, shift)) <= COUNTED * reach
-    counts = near and before - after >= least_fall and after <= most_left * before
-    return (before - after, shift) if counts and before <= MOST_RESIDUAL else _NO_SHIFT
+    around = np.abs(np.arange(-reach, reach + 1))
+    near = np.maximum(around[:, None], around) <= COUNTED * reach
+    with np.errstate(invalid="ignore"):
+        counts = near & (unmoved - left >= least_fall) & (unmoved <= MOST_RESIDUAL) & (unmoved >= OUTSTANDING * usual)
+    shares = np.full(left.shape, np.inf)
+    shares[counts] = left[counts] / unmoved[counts]
+    row, column = np.unravel_index(int(shares.argmin()), shares.shape)
+    if shares[row, column] > most_left or row == column == reach:
+        return _NO_SHIFT
+    return float(unmoved[row, column] - left[row, column]), (int(column) - reach, int(row) - reach)
 
 
 def _residual(count: Doubles, products: Doubles, sums: Doubles, squares: Doubles) -> Doubles:
