@@ -16,7 +16,7 @@ from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck
 from splinecli.diagnosis.light_warnings import light_warnings
-from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
+from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Reading
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
@@ -161,21 +161,14 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
 
     Readings that leave more than the largest ratio of the residual are not named.
     """
-    kinds: set[Kind] = {"offset", "intensities"}
-    if seen.linear:
-        kinds.add("curve")
-    if not seen.has_positions:
-        kinds.add("near")
-    readings = seen.readings
-    likeliest = readings.likeliest(kinds)
-    if likeliest is None or likeliest[1] < LIKELY:
+    if seen.likeliest_reading is None or seen.likeliest_reading[1] < LIKELY:
         return []
-    reading, _ = likeliest
+    reading, _ = seen.likeliest_reading
     if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
         return []
     if reading.kind == "intensities" and seen.estimated is not None:
         return []  # they are divided out
-    error_deg = readings.error_deg(reading, seen.estimated)
+    error_deg = seen.readings.error_deg(reading, seen.estimated)
     left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
     if reading.kind == "curve":
         text = (
@@ -240,10 +233,6 @@ CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (shifted_images, READ_OTHERWISE),
     (other_scale, REPEATED),
     (odd_image, REPEATED | {codes.IMAGE_SCALE}),
-    (
-        lambda seen: other_readings(seen, DECISIVE),
-        REPEATED | {codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.IMAGE_SCALE},
-    ),
     (
         lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict),
         REPEATED | READ_OTHERWISE,

@@ -18,7 +18,7 @@ from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
-from splinecli.diagnosis.readings import Readings
+from splinecli.diagnosis.readings import Kind, Reading, Readings
 from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
@@ -127,6 +127,16 @@ class Evidence:
         observations = self.observations if self.intensities is None else self.observations * self.intensities
         sample = replace(self.sample, observations=observations)
         return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
+
+    @cached_property
+    def likeliest_reading(self) -> tuple[Reading, float] | None:
+        """The other reading that fits the images best, and its probability; None if nothing can be said."""
+        kinds: set[Kind] = {"offset", "intensities"}
+        if self.linear:
+            kinds.add("curve")
+        if not self.has_positions:
+            kinds.add("near")
+        return self.readings.likeliest(kinds)
 
     @cached_property
     def light_check(self) -> LightCheck:
