@@ -80,13 +80,19 @@ def correct_errors(
     return True
 
 
+_COMMON_SHAPE = 3.5  # of the distribution of an error that all normals share: four of five are within a factor of 1.6
+
+
 def add_common_error(errors: Floats32, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
     Wrong lights or values turn the normals together. The medians of both errors are added as those of independent
-    errors are.
+    errors are, and the shape approaches that of the common error where it is the larger one.
     """
-    errors[:, 0] = np.logaddexp(2 * errors[:, 0], 2 * np.log(np.radians(error_deg))) / 2
+    own = 2 * errors[:, 0]
+    errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
+    share = -np.expm1(own - 2 * errors[:, 0])
+    errors[:, 1] += share * (np.log(_COMMON_SHAPE) - errors[:, 1])
 
 
 class CaptureFeatures(NamedTuple):

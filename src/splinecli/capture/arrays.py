@@ -71,9 +71,15 @@ def capture_from_arrays(
             path = Path(f"images[{index}]")
             yield StoredPixels(path, values, linear_light(values, path), intensities[index])
 
-    observations, saturation, warnings = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)
+    observations, saturation, warnings, colours = collect_observations(
+        pixels(), int(inside.sum()), n_lights, white_level
+    )
+    if colours is not None:
+        intensities = intensities * colours
+        observations = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)[0]
     indices, level = tuple(range(n_lights)), saturation.white_level
     capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
+    capture = replace(capture, estimated_colours=colours)
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)

@@ -32,6 +32,7 @@ DISPLAY_DECODED = "display_decoded"
 DISPLAY_ENCODED = "display_encoded"
 EIGHT_BIT = "eight_bit"
 ENCODED_VALUES = "encoded_values"
+ESTIMATED_COLOURS = "estimated_colours"
 ESTIMATED_INTENSITIES = "estimated_intensities"
 ESTIMATED_LIGHTS = "estimated_lights"
 EXIF_ORIENTATION = "exif_orientation"
@@ -51,6 +52,7 @@ LAMPS_NEAR = "lamps_near"
 LAMP_DISTANCE = "lamp_distance"
 LIGHTS_MATCHED = "lights_matched"
 LIGHTS_UNCHECKED = "lights_unchecked"
+LIGHT_COLOURS = "light_colours"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
 MASK_INVERTED = "mask_inverted"
@@ -69,7 +71,7 @@ WHITE_LEVEL = "white_level"
 
 PROBABLY_WRONG = frozenset({
     CONSTANT_LIGHT, ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_SHIFTED, GROUND_TRUTH_Z, IMAGE_ODD, IMAGE_SCALE,
-    IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, MASK_INVERTED,
+    IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR, LIGHT_COLOURS, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, MASK_INVERTED,
     REPEATED_IMAGES, UNEQUAL_INTENSITIES,
 })  # fmt: skip
 """Warnings that say that an input is probably wrong. With --strict they are errors."""

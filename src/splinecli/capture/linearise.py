@@ -14,6 +14,7 @@ from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, to_linear
+from splinecli.capture.restore.lamp_colours import SAMPLE, lamp_colours
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
 from splinecli.capture.window import Window
 from splinecli.errors import InputError
@@ -174,18 +175,23 @@ class StoredPixels:
 
 def collect_observations(
     images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None
-) -> tuple[Singles, Saturation, list[CaptureWarning]]:
-    """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
+) -> tuple[Singles, Saturation, list[CaptureWarning], Doubles | None]:
+    """Return observations (P, F) of the images, in their order, which are saturated, warnings, and colours of lamps.
+
+    The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are not divided out.
 
     Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
     it is above an image's full scale.
     """
     observations = np.empty((n_pixels, n_images), np.float32)
-    any_8_bit, found = False, []
+    any_8_bit, found, colours = False, list[ImageValues](), list[Singles]()
+    compared = np.linspace(0, n_pixels - 1, min(n_pixels, SAMPLE)).astype(np.intp)
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
         found.append(image.find_saturated(white_level))
         observations[:, position] = image.observe()
+        if image.linear.shape[1] == 3:
+            colours.append(replace(image, linear=image.linear[compared]).colours())
         del image  # before the next one is decoded
     saturation = Saturation(n_pixels, tuple(found), white_level)
     warnings = codes.white_level(saturation.white_level)
@@ -198,4 +204,5 @@ def collect_observations(
         text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
         text += " Leave them out with a mask or with --auto-mask."
         warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
-    return observations, saturation, warnings + codes.eight_bit(any_8_bit)
+    of_lamps, found_warnings = lamp_colours(np.stack(colours)) if len(colours) == n_images else (None, [])
+    return observations, saturation, [*warnings, *codes.eight_bit(any_8_bit), *found_warnings], of_lamps

@@ -26,6 +26,7 @@ _DTYPES = {
     "mask": np.bool_,
     "ground_truth": np.float32,
     "estimated_intensities": np.float64,
+    "estimated_colours": np.float64,
     "restored": np.bool_,
 }
 _BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy of a large capture
@@ -47,6 +48,8 @@ class Capture:
         warnings: faults that reduce accuracy, and decisions that were made for the user.
         estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
             intensities and the images show that they differ; else None.
+        estimated_colours: (F, 3) float64, the colours of the lamps, by which the channels were divided because they
+            differ from image to image; else None.
         restored: (P, F) bool, true where an observation was saturated and an estimate stands in its place; None
             where no observation was restored.
         white_level: the stored value from which observations counted as saturated; None for floating-point images
@@ -69,6 +72,7 @@ class Capture:
     ground_truth: Singles | None = None
     warnings: tuple[CaptureWarning, ...] = ()
     estimated_intensities: Doubles | None = None
+    estimated_colours: Doubles | None = None
     restored: Bools | None = None
     white_level: WhiteLevel | None = None
     lamps: NearLamps | None = None
@@ -110,6 +114,7 @@ class Capture:
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
             estimated_intensities=None if self.estimated_intensities is None else self.estimated_intensities[chosen],
+            estimated_colours=None if self.estimated_colours is None else self.estimated_colours[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
             lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
             light_errors_deg=None if self.light_errors_deg is None else self.light_errors_deg[chosen],
@@ -138,6 +143,7 @@ class Capture:
             hint = "A normal has three unknowns, so three images under different lights are the fewest"
             raise InputError(f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}", hint=hint)
         self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
+        self._check_shape("light colours", self.estimated_colours, (len(lights), 3))
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")
         if (np.abs(np.linalg.norm(lights, axis=1) - 1) > _UNIT_TOLERANCE).any():

@@ -9,7 +9,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
+from splinecli.capture.capture_warnings import (
+    ESTIMATED_COLOURS,
+    GROUND_TRUTH_UPSIDE_DOWN,
+    CaptureWarning,
+    mask_inverted,
+)
 from splinecli.capture.formats.damage import stderr_is_apart
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize, check_capture, check_stored_size, common_size
@@ -102,7 +107,18 @@ class CaptureSource:
             ground_truth = self.window.of(ground_truth)
         images = self.read_pixels(mask, indices, lambda pixels: pixels, progress)
         n_pixels = int(np.count_nonzero(mask))
-        observations, saturation, warnings = collect_observations(images, n_pixels, len(indices), self.white_level)
+        collected = collect_observations(images, n_pixels, len(indices), self.white_level)
+        observations, saturation, warnings, colours = collected
+        if colours is not None and ESTIMATED_COLOURS not in [
+            each.code for each in self.warnings
+        ]:  # read again, because only the mean of the channels was kept
+            del images, collected, observations
+            rgb = self.light_intensities.copy()
+            rgb[list(indices)] *= colours
+            warnings = [each for each in warnings if each.code == ESTIMATED_COLOURS]
+            again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
+            stored = again.read_stored(indices, progress)
+            return replace(stored, capture=replace(stored.capture, estimated_colours=colours))
         warnings = [*self.warnings, *warnings]
         if upside_down:
             text = "The rows of the ground truth are in the wrong order; the map was turned upside down."

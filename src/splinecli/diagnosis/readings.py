@@ -47,6 +47,10 @@ this share of the variance of the places; then near lamps cost so much more."""
 
 END_COST = 1.3  # of a distance at an end of WIDTHS, where the residual may fall beyond
 
+VARIED_SPREAD, FLAT_POWER = 0.3, 0.45
+"""Spread of the normals (their second largest standard deviation) from which powers count in full, and the share of
+them that counts for a plate."""
+
 LIKELY = 0.5  # probability from which a reading is named
 
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
@@ -126,9 +130,10 @@ class Readings:
             found.append(unequal)
             if "curve" in kinds:  # unequal lamps may hide a curve
                 curve = self._best_curve(free=True)
-                of_lamps = -COSTS["intensities"] - POWERS["intensities"] * np.log(unequal.ratio)
-                evidence = curve.evidence + of_lamps - _cost_of_equal(curve.intensities)
-                found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=float(evidence)))
+                # The intensities under the curve count, not those that a linear reading needs.
+                of_lamps = unequal.evidence + _cost_of_equal(free.intensities) - _cost_of_equal(curve.intensities)
+                evidence = curve.evidence + of_lamps
+                found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
         return found
 
     def likeliest(self, kinds: Collection[Kind]) -> tuple[Reading, float] | None:
@@ -189,11 +194,16 @@ class Readings:
 
 
 def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
-    """Return the best of some fits by their amounts, which has this cost beside that of its kind."""
+    """Return the best of some fits by their amounts, which has this cost beside that of its kind.
+
+    The pixels of a flat object repeat each other, so that a reading may fit them by chance.
+    """
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(unit(given.normals).T))[1])
+    power = POWERS[kind] * float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
     ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
-    evidence = -COSTS[kind] - cost - POWERS[kind] * np.log(ratio)
+    evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 

@@ -125,6 +125,8 @@ def estimate_capture(
 
         texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
         found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
-    warnings += [*found, *check_confidence(estimate.expected_under_5)]
+    warnings += found
+    if not any(warning.error_deg for warning in warnings):  # these say why the confidence is low
+        warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled

@@ -42,6 +42,8 @@ def albedo_map(
         cosines, strengths = _shading(capture, normals, slice(None), [position])
         cosine = cosines[:, 0] * counts[:, position]
         colours /= strengths
+        if capture.estimated_colours is not None:
+            colours /= capture.estimated_colours[position].astype(np.float32)
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine

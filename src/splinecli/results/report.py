@@ -76,7 +76,7 @@ def report_of(
         "precision": estimator.precision,
         "distillation": distillation,
         "peak_memory_mib": peak_memory_mib(),
-        "warnings": [asdict(warning) for warning in capture.warnings],
+        "warnings": [{"code": warning.code, "text": warning.text} for warning in capture.warnings],
         "angular_error_deg": None
         if errors is None
         else {name: round(value, 4) for name, value in asdict(errors).items()},
