@@ -19,12 +19,12 @@ REACH, COUNTED = 0.2, 0.75
 """Shifts are compared up to this share of the smaller side of the object, and count up to that share of it: where a
 model is wrong in another way, the residual often falls on and on."""
 
-LEAST_FALL, MOST_LEFT, MOST_LEFT_OF_FEW = 0.05, 0.5, 0.35
+LEAST_FALL, MOST_LEFT, MOST_LEFT_OF_FEW = 0.03, 0.5, 0.35
 """A shift counts if the residual falls by the first, as a share of the image's brightness, and to the second or less of
 what it was: in the whole image, and in most halves of it. With fewer than MANY_IMAGES it is the third: gloss on a
 rendered sphere under eight lights reached 0.4."""
 
-OF_MANY = (0.03, 0.7)
+OF_MANY = (0.02, 0.7)
 """The same two for half of the images, against the other half. Of 202 right captures, none left less than 0.77."""
 
 OUTSTANDING = 2.0
@@ -183,8 +183,11 @@ class _MatteModel:
         found = [compared for compared in map(self._compared, places) if compared is not None]
         if len(found) < len(places) / 2:
             return _NO_SHIFT
-        left, unmoved = (np.mean([each[part] for each in found], axis=0) for part in (0, 1))
-        return _least(left, unmoved, *OF_MANY, usual)
+        with np.errstate(invalid="ignore", divide="ignore"):  # medians, so that one shifted image does not decide
+            shares = np.median([each.left / each.unmoved for each in found], axis=0)
+        unmoved = np.median([each.unmoved for each in found], axis=0)
+        known = np.isfinite(shares) & np.isfinite(unmoved)
+        return _least(np.where(known, shares * unmoved, np.inf), unmoved, *OF_MANY, usual)
 
     def _left_in_halves(self, scaled: Doubles, good: Doubles, kept: Doubles, image: Doubles, shift: Shift) -> float:
         """Return the median share that a shift leaves in the upper, lower, left and right half.
