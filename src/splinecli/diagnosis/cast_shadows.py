@@ -22,9 +22,9 @@ MISSING, MISSING_OF_OTHER = 0.02, 0.1
 """From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
 reading has at most the second part of it."""
 
-OPEN_MISSING = 0.003
-"""The same share, above which lights may be wrong, if the other reading has less. No real surface has slopes this steep
-and casts no shadow."""
+OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.003, 0.8
+"""The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were rendered
+without cast shadows, which is not evidence against the lights."""
 
 _FEWEST_SHARE, _FEWEST = 0.001, 20  # of lit observations in shadow, below which they are noise and highlights
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
@@ -51,7 +51,7 @@ class Shadows:
 
     def leaves_open(self, other: Shadows) -> bool:
         """Return whether shadows that this reading needs are missing, more than those of another one."""
-        return self.missing > OPEN_MISSING and other.missing < self.missing
+        return self.missing > OPEN_MISSING and other.missing < OPEN_MISSING_OF_OTHER * self.missing
 
 
 @dataclass(frozen=True, eq=False)
