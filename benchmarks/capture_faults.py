@@ -1,6 +1,6 @@
 """How often faults of a capture are named, and how often right captures are doubted.
 
-    python benchmarks/capture_faults.py [CAPTURE...] [--scenes 72] [--draws 5]
+    python benchmarks/capture_faults.py [CAPTURE...] [--scenes 72] [--draws 5] [--fit]
 
 Renders scenes of all kinds of shapes in all classes of materials, under distant lights and under lamps at 2 to 6 widths
 of the object, and draws 8 to 40 lights. Prints for each fault the shares of captures that get each warning. Of real
@@ -16,13 +16,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
 from splinecli.capture import Capture, open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
+from splinecli.capture.sample import Sample
 from splinecli.diagnosis.checks import check_arrays, check_capture
+from splinecli.diagnosis.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
 from splinecli.maths.transfer import encode_srgb
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -85,7 +88,8 @@ def render(index: int) -> Iterator[Rendered]:
 
 def codes(observations: Array, mask: NDArray[np.bool_], lights: Array, *, measured: bool = True) -> list[str]:
     capture = Capture("rendered", observations.astype(np.float32), lights, tuple(range(len(lights))), mask)
-    found = [warning.code for warning in check_arrays(capture, intensities_measured=measured)]
+    intensities = np.ones(len(lights)) if measured else None
+    found = [warning.code for warning in check_arrays(capture, intensities=intensities)]
     if not measured and estimate_light_intensities(capture.observations, None, lights) is not None:
         found.append("estimated_intensities")
     return found
@@ -117,6 +121,51 @@ def faults(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, lis
     yield "x negated, no mask", codes(picture.reshape(-1, len(lights)), everything, lights * (-1, 1, 1))
 
 
+KINDS: dict[str, Kind | None] = {
+    "right": None, "encoded": "curve", "near": "near", "constant": "offset", "unequal": "intensities",
+}  # fmt: skip
+"""Captures that the readings are fitted to, and the reading that is right."""
+
+PRIOR = {"right": 0.7, "encoded": 0.12, "near": 0.06, "constant": 0.06, "unequal": 0.06}
+
+
+def readings_of(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, list[Reading]]]:
+    """Yield the readings of a scene as it is and with each fault of KINDS."""
+    chosen = rng.choice(N_LIGHTS, int(rng.choice((8, 10, 12, 16))), replace=False)
+    right, near = (images[:, chosen] / np.quantile(images, 0.999) for images in (scene.distant, scene.near))
+    share = rng.choice((0.1, 0.3, 0.8)) * right.mean(axis=1, keepdims=True) / scene.lights[:, 2].mean()
+    unequal = right * np.exp(rng.normal(0, 0.3, len(chosen)))
+    made = {"right": right, "encoded": right, "near": near, "constant": right + share, "unequal": unequal}
+    for kind, images in made.items():
+        images = (images / np.quantile(images, 0.999) + rng.normal(0, NOISE, images.shape)).clip(0, 1)
+        values = encode_srgb(images) / 255.0 if kind == "encoded" else images
+        yield kind, Readings(Sample(values, scene.mask, 1), scene.lights[chosen]).fit(ALL_KINDS)
+
+
+def fit(found: Sequence[tuple[str, list[Reading]]]) -> None:
+    """Print the costs and powers with which the readings of captures are likeliest right."""
+    cases = [(kind, {each.kind: each for each in reversed(readings)}) for kind, readings in found if readings]
+    logs = np.array([[np.log(each[kind].ratio) for kind in ALL_KINDS] for _, each in cases])
+    # What the evidence holds beside cost and power, such as the cost of equal intensities.
+    others = np.array([[each[k].evidence + COSTS[k] for k in ALL_KINDS] for _, each in cases])
+    others += np.array([POWERS[kind] for kind in ALL_KINDS]) * logs
+    right = np.array([0 if KINDS[kind] is None else 1 + ALL_KINDS.index(KINDS[kind]) for kind, _ in cases])
+    counts = Counter(kind for kind, _ in cases)
+    weights = np.array([PRIOR[kind] / counts[kind] for kind, _ in cases])
+
+    def loss(values: Array) -> float:
+        costs, powers = values[: len(ALL_KINDS)], np.exp(values[len(ALL_KINDS) :])
+        evidence = np.concatenate((np.zeros((len(logs), 1)), others - costs - powers * logs), axis=1)
+        surprise = np.logaddexp.reduce(evidence, axis=1) - evidence[np.arange(len(right)), right]
+        return float((weights * surprise).sum())
+
+    start = [*(COSTS[kind] for kind in ALL_KINDS), *(np.log(POWERS[kind]) for kind in ALL_KINDS)]
+    best = minimize(loss, start, method="BFGS")
+    print(f"loss {loss(np.array(start)):.3f} as it is, {best.fun:.3f} at best, of {len(cases)} captures")
+    for place, kind in enumerate(ALL_KINDS):
+        print(f"{kind:12} cost {best.x[place]:.2f}, power {np.exp(best.x[len(ALL_KINDS) + place]):.2f}")
+
+
 def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
     source = open_capture(folder)
     for count in (10, 20, None):
@@ -133,8 +182,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=72)
     parser.add_argument("--draws", type=int, default=5)
+    parser.add_argument("--fit", action="store_true")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    if options.fit:
+        rngs = ((index, np.random.default_rng([SEED, index, 2])) for index in range(options.scenes))
+        fit([case for index, rng in rngs for scene in render(index) for case in readings_of(scene, rng)])
+        return
     total: Counter[tuple[str, str]] = Counter()
     named: dict[tuple[str, str], Counter[str]] = {}
     rows = [(kind, "real", found) for folder in options.captures for kind, found in real(folder, options.draws)]

@@ -23,8 +23,8 @@ MISSING, MISSING_OF_OTHER = 0.02, 0.1
 reading has at most the second part of it."""
 
 OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.003, 0.8
-"""The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were rendered
-without cast shadows, which is not evidence against the lights."""
+"""The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were
+rendered without cast shadows, which is not evidence against the lights."""
 
 _FEWEST_SHARE, _FEWEST = 0.001, 20  # of lit observations in shadow, below which they are noise and highlights
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24

@@ -16,7 +16,7 @@ from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.diagnosis.light_check import LightCheck
 from splinecli.diagnosis.light_warnings import light_warnings
-from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Reading
+from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
 from splinecli.errors import InputError
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
@@ -161,15 +161,15 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
 
     Readings that leave more than the largest ratio of the residual are not named.
     """
-    if seen.likeliest_reading is None or seen.likeliest_reading[1] < LIKELY:
+    if seen.doubt is None or seen.doubt.probability < LIKELY:
         return []
-    reading, _ = seen.likeliest_reading
+    reading = seen.doubt.reading
     if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
         return []
-    if reading.kind == "intensities" and seen.estimated is not None:
-        return []  # they are divided out
     error_deg = seen.readings.error_deg(reading, seen.estimated)
     left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
+    if seen.doubt.others:
+        left += f", but {' and '.join(_CAUSES[kind] for kind in seen.doubt.others)} would explain nearly as much"
     if reading.kind == "curve":
         text = (
             f"The images look display-encoded but are read as linear: if their values are decoded, {left}. Add"
@@ -191,6 +191,14 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
         )
         return [CaptureWarning(codes.CONSTANT_LIGHT, text, error_deg)]
     return [CaptureWarning(codes.UNEQUAL_INTENSITIES, _intensities_text(seen, reading, left), error_deg)]
+
+
+_CAUSES: dict[Kind, str] = {
+    "curve": "a transfer curve (--transfer)",
+    "near": "near lamps (--light-distance)",
+    "offset": "ambient light (--ambient)",
+    "intensities": "unequal intensities (--intensities)",
+}
 
 
 def _intensities_text(seen: Evidence, reading: Reading, left: str) -> str:

@@ -18,7 +18,7 @@ from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import median_turn_deg
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
-from splinecli.diagnosis.readings import Kind, Reading, Readings
+from splinecli.diagnosis.readings import Doubt, Kind, Readings
 from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
 from splinecli.maths.arrays import Doubles, Floats
 from splinecli.maths.solve_3x3 import solve_each
@@ -129,14 +129,16 @@ class Evidence:
         return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
 
     @cached_property
-    def likeliest_reading(self) -> tuple[Reading, float] | None:
+    def doubt(self) -> Doubt | None:
         """The other reading that fits the images best, and its probability; None if nothing can be said."""
         kinds: set[Kind] = {"offset", "intensities"}
         if self.linear:
             kinds.add("curve")
         if not self.has_positions:
             kinds.add("near")
-        return self.readings.likeliest(kinds)
+        # Estimated intensities are divided out.
+        accepted: set[Kind] = set() if self.estimated is None else {"intensities"}
+        return self.readings.likeliest(kinds, accepted=accepted)
 
     @cached_property
     def light_check(self) -> LightCheck:

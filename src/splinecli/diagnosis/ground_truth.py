@@ -49,7 +49,8 @@ def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats 
         f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
         f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
     )
-    return [CaptureWarning(code, text)]
+    # Either the ground truth or the normals are wrong by this angle.
+    return [CaptureWarning(code, text, angles[0] if code == codes.GROUND_TRUTH_FRAME else None)]
 
 
 def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWarning]:
@@ -75,10 +76,12 @@ def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWar
     if after > SHIFT_LEFT * _rotated_angle_deg(normals[known], truth[known]):
         return []
     directions = ((right, "right", "left"), (down, "down", "up"))
-    named = " and ".join(f"{abs(by) * sample.step} {more if by > 0 else less}" for by, more, less in directions if by)
+    named = " and ".join(
+        f"{abs(by) * sample.step} pixels {more if by > 0 else less}" for by, more, less in directions if by
+    )
     text = (
-        f"The ground truth is {before:.1f} degrees from normals that fit the images, but {after:.1f} degrees if it is"
-        f" moved back by {named} pixels: it is probably shifted against the images, so the errors mean nothing."
+        f"The ground truth is {before:.1f} degrees from normals that fit the images, but {after:.1f} degrees once"
+        f" a shift of {named} is undone: it is probably shifted against the images, so the errors mean nothing."
     )
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -51,6 +51,9 @@ VARIED_SPREAD, FLAT_POWER = 0.3, 0.45
 """Spread of the normals (their second largest standard deviation) from which powers count in full, and the share of
 them that counts for a plate."""
 
+UNEQUAL_RESIDUAL = 0.06  # of a flat object under lamps that differ by 20 %; gloss leaves less
+
+_TOLD_APART = 0.3  # share of the probability of the likeliest reading from which another is named beside it
 LIKELY = 0.5  # probability from which a reading is named
 
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
@@ -77,6 +80,14 @@ class Reading:
     evidence: float  # logarithm of its probability over that of the given reading
     normals: Doubles  # (p, 3), scaled, at the chosen pixels
     intensities: Doubles  # (F,), mean 1; ones unless they are free
+
+
+class Doubt(NamedTuple):
+    """How likely the given reading is wrong, and the reading that is right then."""
+
+    reading: Reading
+    probability: float  # that any other reading is right
+    others: tuple[Kind, ...]  # kinds of readings that the images hardly tell apart from it
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +147,26 @@ class Readings:
                 found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
         return found
 
-    def likeliest(self, kinds: Collection[Kind]) -> tuple[Reading, float] | None:
-        """Return the reading of these kinds that fits best, and its probability; None if nothing can be said."""
+    def likeliest(self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()) -> Doubt | None:
+        """Return the reading of these kinds that fits best, and how likely it is; None if nothing can be said.
+
+        Kinds that are `accepted` are part of the given reading.
+        """
         found = self.fit(kinds)
         if not found:
             return None
         evidence = np.array([reading.evidence for reading in found])
         probabilities = np.exp(evidence - np.logaddexp.reduce([0.0, *evidence]))
-        first = int(np.argmax(probabilities))
-        same_kind = [
-            share for reading, share in zip(found, probabilities, strict=True) if reading.kind == found[first].kind
-        ]
-        return found[first], float(sum(same_kind))
+        shares = dict.fromkeys((reading.kind for reading in found if reading.kind not in accepted), 0.0)
+        for reading, probability in zip(found, probabilities, strict=True):
+            if reading.kind in shares:
+                shares[reading.kind] += float(probability)
+        ranked = sorted(shares, key=lambda kind: -shares[kind])
+        if not ranked:
+            return None
+        best = max((reading for reading in found if reading.kind == ranked[0]), key=lambda reading: reading.evidence)
+        others = [kind for kind in ranked[1:] if shares[kind] > _TOLD_APART * shares[ranked[0]]]
+        return Doubt(best, sum(shares.values()), tuple(others))
 
     def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
         """Return the median angle in degrees between the normals of a reading and those of the given one.
@@ -199,7 +218,9 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
     """
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(unit(given.normals).T))[1])
-    power = POWERS[kind] * float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
+    power = POWERS[kind]
+    if kind != "intensities" or given.residual < UNEQUAL_RESIDUAL:
+        power *= float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
     ratio = (found.residual + _LEAST) / (given.residual + _LEAST)

@@ -9,6 +9,7 @@ Yuille, "The bas-relief ambiguity", IJCV 1999). The albedo then changes with the
 import numpy as np
 
 from splinecli.capture.robust_fit import fit_robustly, lit_values, shadow_weights
+from splinecli.diagnosis.cast_shadows import cast_shadows
 from splinecli.diagnosis.frame_evidence import smooth_normals
 from splinecli.maths.arrays import Bools, Doubles, Singles
 from splinecli.maths.normals import unit
@@ -23,8 +24,6 @@ _FITS = 5
 _LEAST_Z = 0.1  # of normals that are integrated
 _FACING = 0.15  # predicted share of a pixel's brightest observation, above which darkness is a cast shadow
 _SHADOW = 0.5  # of the predicted brightness
-_CLEARANCE = 0.5  # in blocks, by which the surface must rise above a ray to stop it
-_STEPS = np.unique(np.round(1.5 * 1.12 ** np.arange(40)))  # along a ray, in blocks
 _DARK_SHARE = 0.02  # of the brightest hundredth
 
 _LOW_DEG = 55.0  # mean elevation of lights, below which the network finds them too high
@@ -55,33 +54,15 @@ def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles)
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(scaled)
     normals[..., 2] = np.where(mask, normals[..., 2].clip(min=_LEAST_Z), 0)
-    heights = integrate_normals(unit(normals), mask)
+    heights = np.where(mask, integrate_normals(unit(normals), mask), np.nan)
     predicted = scaled @ light_directions.T
     facing = bright & (predicted > _FACING)
     dark = values[facing] < _SHADOW * predicted[facing]
     bump, hollow = (
-        _correlation(_cast_shadows(sign * heights, mask, light_directions * (sign, sign, 1))[facing], dark)
+        _correlation(cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark)
         for sign in (1, -1)
     )
     return _SHADOW_LOG_ODDS * (bump - hollow) + _OUTLINE_LOG_ODDS * outline
-
-
-def _cast_shadows(heights: Doubles, mask: Bools, light_directions: Doubles) -> Bools:
-    """Return which pixels (p, F) of a mask (h, w) the surface hides from each light; one pixel is one unit of height.
-
-    The surface does not continue outside of the mask.
-    """
-    rows, columns = np.nonzero(mask)
-    surface = np.pad(np.where(mask, heights, -np.inf), 1, constant_values=-np.inf)
-    own = heights[mask]
-    shadows = np.zeros((len(own), len(light_directions)), np.bool_)
-    for light, (x, y, z) in enumerate(light_directions):
-        across = max(float(np.hypot(x, y)), 1e-6)
-        for step in _STEPS[max(mask.shape) >= _STEPS]:
-            row = np.clip(np.rint(rows - step * y / across).astype(int), -1, mask.shape[0])
-            column = np.clip(np.rint(columns + step * x / across).astype(int), -1, mask.shape[1])
-            shadows[:, light] |= surface[row + 1, column + 1] - own - step * z / across > _CLEARANCE
-    return shadows
 
 
 def _correlation(predicted: Bools, seen: Bools) -> float:

@@ -12,7 +12,13 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from splinecli.capture import Capture
-from splinecli.capture.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.capture.capture_warnings import (
+    NOT_DISTILLED,
+    PROBABLY_WRONG,
+    ROUGH_LIGHTS,
+    UNTRAINED_LIGHTS,
+    CaptureWarning,
+)
 from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
 from splinecli.errors import UsageError
 from splinecli.inference import NormalEstimate, estimate_normals, light_on
@@ -126,7 +132,8 @@ def estimate_capture(
         texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
         found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
     warnings += found
-    if not any(warning.error_deg for warning in warnings):  # these say why the confidence is low
+    # Others of these say why the confidence is low.
+    if not any(warning.error_deg and warning.code in PROBABLY_WRONG for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled

@@ -162,11 +162,16 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
             sync_names(folder, *made)
             left = []
             for path in folder.glob(f".*{UNFINISHED}"):
-                # The probe of another batch that runs is locked, and stays.
-                with suppress(BusyError):
-                    if is_plain(path):
-                        with locked_file(path):
-                            left.append(path)
+                if not is_plain(path):
+                    continue
+                try:
+                    with locked_file(path):
+                        left.append(path)
+                except BusyError:
+                    pass  # the probe of another batch that runs
+                except OutputError:  # another user's, which may be removed but not opened
+                    path.unlink()
+                    left.append(path)
             if left:
                 warn(f"{folder}: {UNDONE}")
         yield

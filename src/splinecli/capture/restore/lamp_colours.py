@@ -18,6 +18,10 @@ LEAST_CHANGE, MOST_SCATTER = 0.15, 0.4
 which the pixels may differ. White LEDs differ by 0.05. Light from other parts of the object varies over the pixels."""
 
 LEAST_CHANNEL = 0.1  # of a lamp's mean colour; a fainter channel is mostly noise
+LEAST_VARIETY, STRIPED_VARIETY = 0.05, 0.5
+"""Standard deviation over the pixels of the logarithm of a channel against the others: below the first, the object has
+one colour; at the second, it has stripes of strong colours."""
+
 UNKNOWN_ERROR_DEG = 15.0  # of striped objects under lamps of pure colours, whose colours cannot be divided out
 
 _DARK_SHARE = 0.15  # of the brightest hundredth of the sample, in every image
@@ -45,7 +49,9 @@ def lamp_colours(colours: Floats) -> tuple[Doubles | None, list[CaptureWarning]]
     image, channel = np.unravel_index(np.abs(common).argmax(), common.shape)
     most = float(abs(common[image, channel]))
     scatter = float(np.median(np.abs(changes[image, :, channel] - common[image, channel])))
-    if most < LEAST_CHANGE or scatter > MOST_SCATTER * most:
+    # An object of one colour only looks brighter under one lamp and darker under another.
+    variety = float(np.median(logs.std(axis=1).max(axis=1)))
+    if most < LEAST_CHANGE or scatter > MOST_SCATTER * most or variety < LEAST_VARIETY:
         return None, []
     found = np.exp(common)
     found /= found.mean(axis=1, keepdims=True)
@@ -53,6 +59,7 @@ def lamp_colours(colours: Floats) -> tuple[Doubles | None, list[CaptureWarning]]
     if found.min() < LEAST_CHANNEL:
         text = f"{said}, and some lamps lack a colour, so it cannot be divided out. The normals of coloured objects are"
         text += " wrong. Use white lamps, or give RGB intensities with --intensities FILE."
-        return None, [CaptureWarning(codes.LIGHT_COLOURS, text, UNKNOWN_ERROR_DEG)]
+        error_deg = UNKNOWN_ERROR_DEG * min(1.0, variety / STRIPED_VARIETY)
+        return None, [CaptureWarning(codes.LIGHT_COLOURS, text, error_deg)]
     text = f"{said}: it was estimated from the images and divided out. Use --intensities FILE if you have measured it."
     return found, [CaptureWarning(codes.ESTIMATED_COLOURS, text)]
