@@ -19,7 +19,7 @@ def test_a_shifted_ground_truth(side: int, gloss: float) -> None:
     by = sample.step * round(3 * side / 56 / sample.step)
     (warning,) = check_ground_truth(sample, LIGHTS, np.roll(truth, (-by, by), (0, 1)))
     assert warning.code == "ground_truth_shifted" and warning.error_deg is None
-    assert f"if it is moved back by {by} right and {by} up pixels" in warning.text
+    assert f"a shift of {by} pixels right and {by} pixels up is undone" in warning.text
 
 
 def test_tilted_lights_are_no_shift() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splinecli.capture.capture_warnings import ESTIMATED_COLOURS
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
@@ -74,6 +75,8 @@ def capture_from_arrays(
     observations, saturation, warnings, colours = collect_observations(
         pixels(), int(inside.sum()), n_lights, white_level
     )
+    if as_stored:
+        warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
     if colours is not None:
         intensities = intensities * colours
         observations = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)[0]

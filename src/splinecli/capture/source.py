@@ -91,13 +91,20 @@ class CaptureSource:
             InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
                 the lights cannot give normals (see Capture).
         """
-        stored = self.read_stored(light_indices, progress)
+        stored = self.read_stored(light_indices, progress, divide_colours=not as_stored)
         return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
     def read_stored(
-        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None
+        self,
+        light_indices: Sequence[int] | None = None,
+        progress: Progress = lambda: None,
+        *,
+        divide_colours: bool = True,
     ) -> StoredCapture:
-        """Return the stored values under the chosen lights and the data needed to restore them; see read."""
+        """Return the stored values under the chosen lights and the data needed to restore them; see read.
+
+        With `divide_colours`, colours of lamps that differ are divided out, unless the user says that lamps are equal.
+        """
         everything = tuple(range(self.n_lights))
         indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
         mask = self._read_mask_if_room(indices)
@@ -109,9 +116,11 @@ class CaptureSource:
         n_pixels = int(np.count_nonzero(mask))
         collected = collect_observations(images, n_pixels, len(indices), self.white_level)
         observations, saturation, warnings, colours = collected
-        if colours is not None and ESTIMATED_COLOURS not in [
-            each.code for each in self.warnings
-        ]:  # read again, because only the mean of the channels was kept
+        equal = self.intensities_known and not self.intensities_measured
+        if equal or not divide_colours:
+            warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
+        # Only the mean of the channels was kept, so the images are read again, once.
+        if colours is not None and ESTIMATED_COLOURS not in [each.code for each in self.warnings]:
             del images, collected, observations
             rgb = self.light_intensities.copy()
             rgb[list(indices)] *= colours

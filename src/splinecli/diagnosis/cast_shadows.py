@@ -22,7 +22,7 @@ MISSING, MISSING_OF_OTHER = 0.02, 0.1
 """From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
 reading has at most the second part of it."""
 
-OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.003, 0.8
+OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.01, 0.75
 """The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were
 rendered without cast shadows, which is not evidence against the lights."""
 

@@ -73,7 +73,9 @@ def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_fil
     ]
     twin = mirror_twin(check, best)
     names = [each.name if each.frame is None else f"with {each.name}" for each in (best, twin) if each is not None]
-    text = f"The lights give normals that fit a surface much better {' or '.join(names)} ({', '.join(figures)})"
+    text = f"The lights give normals that fit a surface much better {' or '.join(names)}"
+    if figures:
+        text += f" ({', '.join(figures)})"
     if best.is_order:
         return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
     which = "They exchange hollows and bumps; without a closed outline, only you can tell which is right."

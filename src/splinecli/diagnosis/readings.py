@@ -28,7 +28,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
 
-EXPONENTS = (1.4, 1.8, 2.2, 2.6)  # of gamma curves
+EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
 OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over what a pixel shows at right angles
@@ -51,6 +51,7 @@ VARIED_SPREAD, FLAT_POWER = 0.3, 0.45
 """Spread of the normals (their second largest standard deviation) from which powers count in full, and the share of
 them that counts for a plate."""
 
+FEW_POWER = 0.6  # share of the power under four or five lights
 UNEQUAL_RESIDUAL = 0.06  # of a flat object under lamps that differ by 20 %; gloss leaves less
 
 _TOLD_APART = 0.3  # share of the probability of the likeliest reading from which another is named beside it
@@ -217,15 +218,21 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
 
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
     """
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(unit(given.normals).T))[1])
-    power = POWERS[kind]
-    if kind != "intensities" or given.residual < UNEQUAL_RESIDUAL:
-        power *= float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
     ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
+    power = POWERS[kind]
+    if len(given.intensities) < _LEAST_LIGHTS["curve"]:
+        power *= FEW_POWER
+    if kind != "intensities" or given.residual < UNEQUAL_RESIDUAL:
+        power *= float(np.clip(max(_spread(given), _spread(found)) / VARIED_SPREAD, FLAT_POWER, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
+
+
+def _spread(fit: _Fit) -> float:
+    """Return the second largest standard deviation of the normals."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(unit(fit.normals).T))[1]))
 
 
 def _cost_of_equal(intensities: Doubles) -> float:

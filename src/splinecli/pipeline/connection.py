@@ -14,7 +14,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.errors import UsageError
+from splinecli.errors import SplinecliError, UsageError
 from splinecli.system.devices import count_available_cores
 from splinecli.system.extras import import_extra
 from splinecli.system.files import read_json
@@ -131,15 +131,25 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     }
     _start_resource_tracker()
     with dask.config.set(settings):
-        cluster = LocalCluster(
-            n_workers=options.workers,
-            threads_per_worker=1,
-            env=environment,  # also where the user's environment has other numbers
-            memory_limit=0,  # what is free on the machine is shared out by Distributor
-            resources={"GPU": 1} if options.gpu else None,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
+        try:
+            cluster = LocalCluster(
+                n_workers=options.workers,
+                threads_per_worker=1,
+                env=environment,  # also where the user's environment has other numbers
+                memory_limit=0,  # what is free on the machine is shared out by Distributor
+                resources={"GPU": 1} if options.gpu else None,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:  # Dask's, of which a cause may be what the system refused
+            cause: BaseException | None = error
+            while cause is not None and not isinstance(cause, OSError):
+                cause = cause.__cause__
+            reason = "" if cause is None else f" ({cause.strerror or cause})"
+            raise SplinecliError(
+                f"the processes of --workers cannot be started{reason}",
+                hint="Leave --workers out, or raise the limits: each needs a temporary folder and 50 open files",
+            ) from error
         try:
             yield cluster
         finally:

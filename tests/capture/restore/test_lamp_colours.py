@@ -34,8 +34,12 @@ def error_deg(observations: NDArray[np.float32], normals: NDArray[np.float64], m
 
 def test_colours_are_divided_out(tmp_path) -> None:
     images, normals, mask = striped(SOFT)
-    source = open_capture(write_capture(tmp_path, images, LIGHTS, mask=mask), intensities="equal")
+    folder = write_capture(tmp_path, images, LIGHTS, mask=mask, intensities=np.ones((10, 3)))
+    source = open_capture(folder)
     capture = source.read()
+    for untouched in (source.read(as_stored=True), open_capture(folder, intensities="equal").read()):
+        assert untouched.estimated_colours is None
+        assert "estimated_colours" not in [warning.code for warning in untouched.warnings]
     assert "estimated_colours" in [warning.code for warning in capture.warnings]
     ratios = capture.estimated_colours / SOFT
     np.testing.assert_allclose(ratios / ratios.mean(axis=0), np.ones((10, 3)), atol=0.1)
@@ -55,6 +59,14 @@ def test_pure_colours_are_named() -> None:
     images, _, mask = striped(PURE)
     codes = {warning.code: warning for warning in capture_from_arrays(images, LIGHTS, mask).warnings}
     assert "light_colours" in codes and codes["light_colours"].error_deg
+
+
+def test_a_gray_object_needs_no_colours() -> None:
+    normals, mask = sphere(48, 0.9)
+    shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
+    images = np.rint(np.einsum("hwf,fc->fhwc", shaded, PURE) * 40_000).astype(np.uint16)
+    capture = capture_from_arrays(images, LIGHTS, mask, light_intensities=np.ones(10))
+    assert not {"light_colours", "estimated_colours"} & {warning.code for warning in capture.warnings}
 
 
 @pytest.mark.parametrize("change", [0.0, 0.03])
