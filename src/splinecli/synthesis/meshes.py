@@ -42,9 +42,17 @@ def read_mesh(path: str | Path) -> Mesh:
     try:
         kind, content = _read_known(path)
         # From its content, so that no file that it names is read.
-        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
+        with np.errstate(all="ignore"):  # it checks the normals of an STL file
+            loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
         if (count := len(loaded.faces)) > MOST_FACES:
             raise InputError(f"found {count} triangles, expected at most {MOST_FACES}", path=path)
+        corners = np.asarray(loaded.vertices, np.float64)[loaded.faces]
+        if count:
+            with np.errstate(all="ignore"):
+                size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+            if not 0 < size < np.inf:  # NaN, too. process() would remove triangles with such corners
+                raise InputError("the corners are not finite numbers, or all in one place", path=path)
+            loaded.vertices = loaded.vertices / size  # trimesh merges corners that are nearer than 1e-8
         loaded.process()
         # Texture coordinates split vertices, and would split the smooth normals too.
         loaded.merge_vertices(merge_tex=True, merge_norm=True)

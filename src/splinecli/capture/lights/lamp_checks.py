@@ -78,7 +78,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     except InputError:
         return []  # a file of angles
     vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]
-    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = np.hypot.reduce(vectors, axis=1)
     if len(lengths) < 3 or lengths.min() < _SHORTEST_POSITION or lengths.max() < _UNEQUAL_LENGTHS * lengths.min():
         return []
     text = (

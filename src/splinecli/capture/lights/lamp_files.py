@@ -11,6 +11,7 @@ import numpy as np
 
 from splinecli.capture.formats.text import read_lines, read_number_rows, to_number
 from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
+from splinecli.capture.lights.lamp_checks import UNIT_HINT
 from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -63,6 +64,7 @@ class LampOptions:
         return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
 
+_FARTHEST = 1e15  # of a lamp. float32 holds the squares of distances up to 1e19
 _OPTIONS = {
     "positions": "--light-positions",
     "distance": "--light-distance",
@@ -103,6 +105,8 @@ class LampFiles:
         else:
             assert self.distance is not None
             positions = source.light_directions * self.distance
+        if (farthest := np.abs(positions).max(initial=0)) > _FARTHEST:
+            raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
         pixel_size, camera_matrix = self.pixel_size, self.camera_matrix
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
