@@ -63,7 +63,8 @@ def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
     for number, (seen, own) in enumerate(captures):
         maps = network.build_maps(seen, own)
         alone = network.estimate(maps, network.interpolate(maps))
-        torch.testing.assert_close(together.normals[number::3], alone.normals, atol=3e-5, rtol=0)
+        # Processors with AMX round sums of other sizes of batches differently; another capture would change 0.01.
+        torch.testing.assert_close(together.normals[number::3], alone.normals, atol=3e-4, rtol=0)
 
 
 def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(network: SplineNet) -> None:

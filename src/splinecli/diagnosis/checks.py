@@ -8,6 +8,7 @@ import numpy as np
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.robust_fit import fit_robustly
 from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
@@ -166,6 +167,10 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
     reading = seen.doubt.reading
     if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
         return []
+    if reading.kind == "intensities" and seen.intensities is None:
+        observations = np.asarray(seen.observations, np.float32)
+        if estimate_light_intensities(observations, None, seen.directions) is not None:
+            return []  # `infer` estimates them, and says so
     error_deg = seen.readings.error_deg(reading, seen.estimated)
     left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
     if seen.doubt.others:

@@ -68,6 +68,7 @@ _HALVINGS = 3  # of the interval around the best constant light
 _EQUAL_WEIGHT_BELOW = 0.02
 _USUAL_COSINE = 0.8  # between a normal and the light under which its pixel is brightest
 _STEP = 1.5  # exponent of each change of intensities, which saves a third of the fits
+_SAME_VALUE, _CLIPPED_SHARE = 1e-5, 1e-3  # of values that are saturated, and of all values
 _LEAST = 1e-4  # added to residuals; 16 bits do not go below it
 
 
@@ -113,6 +114,11 @@ class Readings:
     ) -> None:
         n_lights = len(lights)
         chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+        clipped = sample.observations[chosen] >= (1 - _SAME_VALUE) * sample.observations.max()
+        if (
+            clipped.sum() > _CLIPPED_SHARE * clipped.size
+        ):  # values at full scale look like a curve; those that are 0 do not count
+            values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
         enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
