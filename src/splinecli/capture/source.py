@@ -119,14 +119,13 @@ class CaptureSource:
         equal = self.intensities_known and not self.intensities_measured
         if equal or not divide_colours:
             warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
-        # Only the mean of the channels was kept, so the images are read again, once.
-        if colours is not None and ESTIMATED_COLOURS not in [each.code for each in self.warnings]:
+        if colours is not None:  # only the mean of the channels was kept, so the images are read again
             del images, collected, observations
             rgb = self.light_intensities.copy()
             rgb[list(indices)] *= colours
             warnings = [each for each in warnings if each.code == ESTIMATED_COLOURS]
             again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
-            stored = again.read_stored(indices, progress)
+            stored = again.read_stored(indices, progress, divide_colours=False)
             return replace(stored, capture=replace(stored.capture, estimated_colours=colours))
         warnings = [*self.warnings, *warnings]
         if upside_down:

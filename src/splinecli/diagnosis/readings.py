@@ -20,10 +20,10 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.robust_fit import fit_scaled_normals, lit_values, shade
+from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, lit_values, shade
 from splinecli.capture.sample import Sample
 from splinecli.maths.arrays import Doubles, Integers
-from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -65,7 +65,6 @@ _SHADOW = 0.1  # share of a pixel's largest value; smaller values are shadow
 _ENCODED_SHADOW = 0.35  # the same if values are encoded
 _FITS, _FREE_FITS, _OFFSET_FITS = 8, 30, 14
 _HALVINGS = 3  # of the interval around the best constant light
-_EQUAL_WEIGHT_BELOW = 0.02
 _USUAL_COSINE = 0.8  # between a normal and the light under which its pixel is brightest
 _STEP = 1.5  # exponent of each change of intensities, which saves a third of the fits
 _SAME_VALUE, _CLIPPED_SHARE = 1e-5, 1e-3  # of values that are saturated, and of all values
@@ -115,9 +114,8 @@ class Readings:
         n_lights = len(lights)
         chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
         clipped = sample.observations[chosen] >= (1 - _SAME_VALUE) * sample.observations.max()
-        if (
-            clipped.sum() > _CLIPPED_SHARE * clipped.size
-        ):  # values at full scale look like a curve; those that are 0 do not count
+        # Values at full scale look like a curve. As shadows, they do not count.
+        if clipped.sum() > _CLIPPED_SHARE * clipped.size:
             values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
@@ -231,14 +229,10 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     if len(given.intensities) < _LEAST_LIGHTS["curve"]:
         power *= FEW_POWER
     if kind != "intensities" or given.residual < UNEQUAL_RESIDUAL:
-        power *= float(np.clip(max(_spread(given), _spread(found)) / VARIED_SPREAD, FLAT_POWER, 1))
+        spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
+        power *= float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
-
-
-def _spread(fit: _Fit) -> float:
-    """Return the second largest standard deviation of the normals."""
-    return float(np.sqrt(np.linalg.eigvalsh(np.cov(unit(fit.normals).T))[1]))
 
 
 def _cost_of_equal(intensities: Doubles) -> float:
@@ -276,7 +270,7 @@ def _fit(
         else:
             normals = fit_scaled_normals(observed, weights, lights * intensities[:, None])
             predicted = shade(normals, lights) * intensities
-        weights = start / (np.abs(observed - predicted) + _EQUAL_WEIGHT_BELOW)
+        weights = start * absolute_weights(observed - predicted)
         if free:
             intensities = _intensities(observed, predicted / intensities, weights, intensities)
     residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]

@@ -23,6 +23,11 @@ def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
     return scaled
 
 
+def spread_of(normals: NDArray[np.floating]) -> float:
+    """Return the second largest standard deviation of unit normals (P, 3): small for a flat object."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
+
+
 def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the angles (...) in degrees between unit vectors a and b (..., 3), float64.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import fit_robustly, lit_values, shade, shadow_weights
 from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
-from splinecli.maths.normals import unit
+from splinecli.maths.normals import spread_of, unit
 
 Lights = Doubles | Callable[[Integers], Doubles]
 
@@ -119,10 +119,9 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     Under a tilt t, a plane that shows k_f needs intensities k_f / l_f . (t, 1). The likeliest tilt leaves intensities
     that are nearly equal, and is small itself. Of other objects, the intensities are returned as they are.
     """
-    if not _is_flat(normals):
+    if spread_of(normals) >= FLAT_SPREAD:
         return intensities
-    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
-    shown = intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
+    directions, shown = _shown(intensities, normals, lights)
     # How unequal the intensities are is measured where a tilt cannot explain it. Otherwise a tilt would count as
     # inequality, and the more tilted an object is, the less its tilt would be believed.
     tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
@@ -130,16 +129,17 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 
-def _is_flat(normals: Doubles) -> bool:
-    return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1])) < FLAT_SPREAD
+def _shown(intensities: Doubles, normals: Doubles, lights: Doubles) -> tuple[Doubles, Doubles]:
+    """Return unit directions (F, 3), and what a plane with the mean normal shows under each light (F,)."""
+    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
+    return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
 
 def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -> bool:
     """Return whether a flat object is nearer to its tilt under equal intensities than to the likeliest tilt."""
-    if not _is_flat(normals):
+    if spread_of(normals) >= FLAT_SPREAD:
         return False
-    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
-    shown = intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
+    directions, shown = _shown(intensities, normals, lights)
     tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
     slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
     error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
