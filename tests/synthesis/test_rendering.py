@@ -134,6 +134,7 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
     generator = torch.Generator().manual_seed(0)
     indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)["matte"].numpy()[:, 0]
+    indirect /= visible.coverage
     again = rho / 2
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
     assert indirect.mean() == pytest.approx(expected, rel=0.02)
@@ -155,11 +156,17 @@ def test_patches_have_their_own_material() -> None:
     np.testing.assert_allclose(direct[above], 1.0, rtol=1e-5)
 
 
-def test_pixels_on_the_outline_are_left_out() -> None:
-    corners = np.array([(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
+def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface() -> None:
+    corners = np.array([(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    square = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up)
-    # Of 10 pixels, 2 .. 7 lie inside; the edge at -0.5 runs through the middle of the third.
-    mask = find_visible_surface(Tracer(square), 10, 2).mask
-    assert mask.sum() == 16
-    assert mask[3:7, 3:7].all()
+    tracer = Tracer(Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up))
+    # Pixels are 0.2 wide. The edge at 0.7 leaves half of a column of pixels, which is 6 of 9 samples; the others are
+    # cut at their last third, or between pixels.
+    visible = find_visible_surface(tracer, 10, 3)
+    direct = render_direct(tracer, visible, directions((0, 0, 1)), matte(1.0), np.zeros(2, np.int64))["matte"]
+    picture = np.zeros((10, 10))
+    picture[visible.mask] = direct[:, 0]
+    np.testing.assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)
+    assert visible.coverage.min() > 0.5
+    np.testing.assert_allclose(direct[:, 0].numpy(), visible.coverage, rtol=1e-6)
+    assert picture.sum() == pytest.approx(1.2 / 0.04, rel=0.1)

@@ -22,6 +22,12 @@ def prepare(
     mesh: list[Path] | None = Option(
         None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated."
     ),
+    views: int = Option(
+        0, metavar="N", min=0, help="Render each mesh N times, from random views. By default once, along its +z axis."
+    ),
+    relief: list[Path] | None = Option(
+        None, metavar="FILE", help="Put this tileable normal map on half of the scenes. May be repeated."
+    ),
     size: int | None = Option(
         None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
     ),
@@ -55,7 +61,7 @@ def prepare(
     summary = prepare_pixel_set(
         output,
         [folder for source in sources or [] for folder in find_captures(source)],
-        ScenePlan(config, seed, scenes, tuple(mesh or ())),
+        ScenePlan(config, seed, scenes, tuple(mesh or ()), views, tuple(relief or ())),
         as_stored=as_stored,
         white_level=white_level,
         update=update,

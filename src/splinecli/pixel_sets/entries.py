@@ -17,7 +17,9 @@ from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
+from splinecli.synthesis.relief import read_relief
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.shapes import draw_view
 from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, free_name, replacing
 
@@ -124,28 +126,43 @@ def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
     )
 
 
-RENDERER = 4  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
+RENDERER = 5  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
 
 # Meshes have random numbers of their own, so that a mesh changes no other scene.
 _FIRST_MESH_INDEX = 1_000_000
+_VIEWS = 10_000  # numbers from one view of a mesh to its next
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first one of each mesh file, then `count` random ones."""
+    """The scenes to render: first those of each mesh file, then `count` random ones."""
 
     config: SceneConfig
     seed: int
     count: int
     meshes: tuple[Path, ...] = ()
+    views: int = 0  # random views of each mesh, see draw_view; 0 for one along its +z axis
+    reliefs: tuple[Path, ...] = ()  # normal maps, for half of the scenes
+
+    @cached_property
+    def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
+        """The mesh of each of its scenes, the scene's name, and its number, which the count of views does not change.
+
+        The name is the file's, with a number if another mesh has it.
+        """
+        taken: list[str] = []
+        for path in self.meshes:
+            taken.append(free_name(path.stem, taken.__contains__))
+        named = [*zip(self.meshes, taken, range(len(taken)), strict=True)]
+        if not self.views:
+            return tuple(named)
+        views = range(self.views)
+        return tuple((path, f"{name}-view{n:03}", mesh + _VIEWS * n) for n in views for path, name, mesh in named)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names of the scenes. A mesh gives its file name, with a number if another mesh has it."""
-        names: list[str] = []
-        for path in self.meshes:
-            names.append(free_name(path.stem, names.__contains__))
-        return (*names, *(f"scene{index:04}" for index in range(self.count)))
+        """The names of the scenes."""
+        return (*(name for _, name, _ in self._of_mesh), *(f"scene{index:04}" for index in range(self.count)))
 
     def entry_names(self, position: int) -> dict[str, str]:
         """Return the names of a scene's entries by material."""
@@ -153,12 +170,17 @@ class ScenePlan:
 
     def recipe(self, position: int) -> dict[str, Any]:
         """Return the values that decide the content of a scene."""
+        meshes = self._of_mesh[position : position + 1]
+        shapes = [file_sha256(path) for path, _, _ in meshes]
+        if meshes and self.views:  # another mesh may touch it
+            shapes += [file_sha256(path) for path in self.meshes]
         return {
             "renderer": RENDERER,
             **asdict(self.config),
             "seed": self.seed,
-            "mesh": file_sha256(self.meshes[position]) if position < len(self.meshes) else None,
-            "measured_share": 0.0,  # earlier versions had a choice
+            "mesh": shapes or None,
+            "views": int(bool(shapes and self.views)),
+            "reliefs": [file_sha256(path) for path in self.reliefs],
         }
 
     def check_inputs(self) -> None:
@@ -172,6 +194,8 @@ class ScenePlan:
                 import_extra(package, "render")
         for path in self.meshes:
             read_mesh(path)
+        for path in self.reliefs:
+            read_relief(path)
 
     def check_set(self, writer: PixelSetWriter) -> None:
         """Raise OutputError if the set has one of the scenes, rendered with other settings."""
@@ -190,10 +214,17 @@ class ScenePlan:
         `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or the
         camera sees nothing; UsageError if the packages of the extra `render` are not installed.
         """
-        mesh_file = self.meshes[position] if position < len(self.meshes) else None
-        mesh = None if mesh_file is None else read_mesh(mesh_file)
-        index = position - len(self.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
-        scene = draw_scene(self.seed, index, self.config, mesh)
+        mesh_file = mesh = None
+        index = position - len(self._of_mesh)
+        if index < 0:
+            mesh_file, _, number = self._of_mesh[position]
+            index = _FIRST_MESH_INDEX + number
+            mesh = read_mesh(mesh_file)
+            if self.views:
+                others = tuple(read_mesh(path) for path in self.meshes if path != mesh_file)
+                mesh = draw_view(mesh, others, np.random.default_rng([self.seed, index, 2]))
+        reliefs = tuple(read_relief(path) for path in self.reliefs)
+        scene = draw_scene(self.seed, index, self.config, mesh, reliefs)
         rendered = render_scene(scene, self.config, progress)
         if not rendered.mask.any():
             raise InputError(
@@ -206,11 +237,15 @@ class ScenePlan:
         observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
         return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
 
+    def _shape_name(self, position: int) -> str:
+        """Return what the views of a mesh share, because they must not both train and validate."""
+        return self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
+
     def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
         """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
         recipe = self.recipe(position)
         for kind, name in self.entry_names(position).items():
-            writer.add(name, self.names[position], f"rendered: {shape}", recipe, pixels[kind])
+            writer.add(name, self._shape_name(position), f"rendered: {shape}", recipe, pixels[kind])
 
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:

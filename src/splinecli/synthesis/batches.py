@@ -29,6 +29,7 @@ class CaptureConfig:
     saturated_share: float = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
     sensor_noise: bool = True  # whether there are noise and quantisation
     eight_bit_share: float = 0.3  # pixels with 8 bits; the others have 10 to 16
+    optics_share: float = 0.75  # captures, photographed as images, that a lens and a sensor changed; see draw_optics
 
     def captures(self, pixels: int) -> int:
         """Return the number G of captures in a draw of so many pixels. Pixel p belongs to capture p % G."""

@@ -15,6 +15,7 @@ from splinecli.system.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
 REACH = 0.94  # half-width of the object in the camera's square
+LONGEST_EDGE = 0.03  # of a face; longer ones are split
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
 """Bytes of a file of each format. A byte of the first three may give a triangle, of 110 bytes in memory."""
@@ -75,7 +76,7 @@ def read_mesh(path: str | Path) -> Mesh:
     if not np.isfinite(vertices).all() or np.ptp(vertices[:, :2], axis=0).max() == 0:
         raise InputError("the mesh has no extent that a camera along -z could see", path=path)
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
-    return split_long_edges(fit_to_frame(mesh), longest=0.03)
+    return split_long_edges(fit_to_frame(mesh), longest=LONGEST_EDGE)
 
 
 def _read_known(path: Path) -> tuple[str, bytes]:

@@ -7,7 +7,8 @@ on glossy metal its radiance is off by a tenth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +138,7 @@ class VisibleSurface:
     normals: Floats  # (P, 3), unit, the mean of the samples' normals; pixels row-major
     samples: Hits  # P * S surface points; those of one pixel follow each other
     samples_per_pixel: int  # S
+    coverage: Floats  # (P,), share of the pixel that the surface fills; below 1 at its outline
 
     def samples_of(self, pixels: NDArray[np.int64]) -> Hits:
         """Return all samples of some pixels."""
@@ -144,10 +146,16 @@ class VisibleSurface:
         return self.samples.take((pixels[:, None] * count + np.arange(count)).ravel())
 
 
-def find_visible_surface(tracer: Tracer, size: int, samples: int) -> VisibleSurface:
+def find_visible_surface(
+    tracer: Tracer, size: int, samples: int, bend: Callable[[Floats, Floats], Floats] | None = None
+) -> VisibleSurface:
     """Trace the camera's rays: size x size pixels of samples x samples samples each.
 
-    A pixel is left out if one of its samples misses the surface, or if it is seen at a grazing angle.
+    A pixel is left out if more than half of its samples miss the surface, or if it is seen at a grazing angle. Samples
+    that miss are replaced by the others of their pixel.
+
+    Args:
+        bend: returns the normals (N, 3) of the samples from those of the mesh and their positions; None to keep them.
     """
     steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(2 / (size * samples)) - 1
     row, column = np.meshgrid(np.arange(size * samples), np.arange(size * samples), indexing="ij")
@@ -160,12 +168,16 @@ def find_visible_surface(tracer: Tracer, size: int, samples: int) -> VisibleSurf
     rays, hits = tracer.first_hits(np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32))
     front = hits.normal[:, 2] > 0
     rays, hits = rays[front], hits.take(front)
+    if bend is not None:
+        hits = replace(hits, normal=bend(hits.normal, hits.position))
     per_pixel = samples * samples
-    pixel = rays // per_pixel
-    whole = np.bincount(pixel, minlength=size * size) == per_pixel
-    hits = hits.take(whole[pixel])
-    normals = unit(hits.normal.reshape(-1, per_pixel, 3).mean(axis=1))
+    found = np.bincount(rays // per_pixel, minlength=size * size)
+    seen = 2 * found > per_pixel
+    first = np.cumsum(found) - found  # row of the first sample of each pixel
+    rows = first[seen, None] + np.arange(per_pixel) % found[seen, None]
+    normals = unit(hits.normal[rows].mean(axis=1))
     kept = normals[:, 2] > MIN_NORMAL_Z
-    whole[whole] = kept
-    mask = whole.reshape(size, size)
-    return VisibleSurface(mask, normals[kept], hits.take(np.repeat(kept, per_pixel)), per_pixel)
+    coverage = (found[seen] / per_pixel).astype(np.float32)
+    seen[seen] = kept
+    mask = seen.reshape(size, size)
+    return VisibleSurface(mask, normals[kept], hits.take(rows[kept].ravel()), per_pixel, coverage[kept])

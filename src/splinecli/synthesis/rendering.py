@@ -67,7 +67,13 @@ def render_direct(
                 shape = (-1, visible.samples_per_pixel, len(lights))
                 torch.mean(shaded.view(shape), dim=1, out=radiance[name][target])
         progress((rows[-1] + 1) / pixels)
-    return radiance
+    return _covered(radiance, visible)
+
+
+def _covered(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
+    """Return the radiance before darkness: what the surface does not fill of a pixel is black."""
+    coverage = torch.from_numpy(visible.coverage)[:, None]
+    return {name: values.mul_(coverage) for name, values in radiance.items()}
 
 
 @dataclass(frozen=True)
@@ -128,7 +134,7 @@ def render_indirect(
             if not len(vertices.pixel):
                 break
         progress((int(rows[-1]) + 1) / pixels)
-    return radiance
+    return _covered(radiance, visible)
 
 
 def soften(material: PrincipledMaterial) -> PrincipledMaterial:

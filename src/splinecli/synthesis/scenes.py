@@ -5,7 +5,7 @@ hemisphere. Further materials take little time, because the paths of light are t
 index), so an interrupted set can be continued.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
+from splinecli.synthesis.relief import Relief, draw_relief
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
@@ -46,6 +47,7 @@ class Scene:
     materials: dict[str, PrincipledMaterial]  # those of MATERIALS, with one row per patch of the surface
     patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
     seed: int  # seed of the paths of indirect light
+    relief: Relief | None = None  # on the surface
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,16 @@ class RenderedScene:
 
     mask: NDArray[np.bool_]  # (H, W)
     normals: Floats  # (P, 3), unit; pixels row-major
-    # those of MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light
+    # those of MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light and fills the pixel
     observations: dict[str, Floats]
 
 
-def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:
+def draw_scene(
+    seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None, reliefs: Sequence[Floats] = ()
+) -> Scene:
     """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
+
+    Half of the scenes have one of the reliefs, if any are given; see draw_relief.
 
     The surface has one patch in 60 % of the scenes, as real objects have one material or few, 2 to 12 in 25 %, and 20
     to 3,000 in 15 %. In half of the scenes the patches differ in their base alone, as on a painted or printed object of
@@ -81,7 +87,11 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
     shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
     patch_of_face = draw_patches(mesh, patches, rng)
-    return Scene(shape, mesh, lights, materials, patch_of_face, render_seed)
+    own = np.random.default_rng([seed, index, 1])
+    relief = None
+    if reliefs and own.random() < 0.5:
+        relief = draw_relief(reliefs[int(own.integers(len(reliefs)))], config.size, own)
+    return Scene(shape, mesh, lights, materials, patch_of_face, render_seed, relief)
 
 
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
@@ -91,7 +101,9 @@ def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], 
     """
     report = progress or (lambda _: None)
     tracer = Tracer(scene.mesh)
-    visible = find_visible_surface(tracer, config.size, config.samples)
+    visible = find_visible_surface(
+        tracer, config.size, config.samples, None if scene.relief is None else scene.relief.bend
+    )
     parts = tracer, visible, scene.lights, scene.materials, scene.patch_of_face
     with torch.inference_mode():
         radiance = render_direct(*parts, progress=lambda share: report(0.4 * share))

@@ -5,13 +5,13 @@ Unions of round blobs alone would be too convex: they have few cast shadows and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from splinecli.synthesis import fields
-from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
+from splinecli.synthesis.meshes import LONGEST_EDGE, Floats, Mesh, fit_to_frame, split_long_edges
 
 SPACING = 0.0125
 """Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
@@ -51,6 +51,41 @@ def draw_rotation(rng: np.random.Generator) -> Floats:
 def turn(mesh: Mesh, rotation: Floats) -> Mesh:
     """Return the mesh, rotated about the origin."""
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
+
+
+_CLOSEST = 2.2  # largest factor by which a view is enlarged
+
+
+def draw_view(mesh: Mesh, others: Sequence[Mesh], rng: np.random.Generator) -> Mesh:
+    """Draw a view of a mesh, which is in the frame.
+
+    The rotation is uniform. In half of the views another mesh, drawn from `others` and scaled by U(0.4, 1), touches it:
+    between bodies there are hollows with long shadows and indirect light. Half of the views are enlarged by
+    U(1, 2.2) around a point of the surface, so that they show a part.
+    """
+    mesh = turn(mesh, draw_rotation(rng))
+    if others and rng.random() < 0.5:
+        mesh = _touching(mesh, turn(others[int(rng.integers(len(others)))], draw_rotation(rng)), rng)
+    mesh = fit_to_frame(mesh)
+    if rng.random() < 0.5:
+        enlarged, middle = rng.uniform(1, _CLOSEST), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
+        shift = np.append(middle * (1 - enlarged), 0)
+        mesh = Mesh((mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals)
+    return split_long_edges(mesh, longest=LONGEST_EDGE)
+
+
+def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
+    """Return both meshes, the other one smaller, moved in a random direction so that it overlaps by 40 % at most."""
+    direction = rng.normal(size=3) * np.array((1, 1, 0.5))
+    direction /= np.linalg.norm(direction)
+    vertices = other.vertices * rng.uniform(0.4, 1.0)
+    depth = np.ptp(vertices @ direction)
+    apart = (mesh.vertices @ direction).max() - (vertices @ direction).min() - rng.uniform(0, 0.4) * depth
+    return Mesh(
+        np.concatenate((mesh.vertices, vertices + apart * direction)).astype(np.float32),
+        np.concatenate((mesh.faces, other.faces + len(mesh.vertices))).astype(np.int32),
+        np.concatenate((mesh.vertex_normals, other.vertex_normals)),
+    )
 
 
 def _draw_solid(rng: np.random.Generator, size: float) -> fields.Field:

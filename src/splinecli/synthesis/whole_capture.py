@@ -18,6 +18,7 @@ from splinecli.synthesis.faults import (
     draw_light_intensities,
     quantise,
 )
+from splinecli.synthesis.optics import draw_optics
 from splinecli.synthesis.random_numbers import draw_number
 
 _BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one from which the exposure is chosen
@@ -80,21 +81,55 @@ def photograph_scene(
     have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many
     degrees, and their detail is still right.
     """
+    return _photograph(radiance, directions, config, generator, None)
+
+
+def photograph_images(
+    images: Tensor, mask: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor, float]:
+    """Photograph images (F, H, W) of radiance with their background; return what photograph_scene does of a mask.
+
+    `config.optics_share` of the captures come from a camera of draw_optics, which mixes neighbouring pixels. Its
+    saturation and noise are those of the sensor, before a Bayer pattern is interpolated.
+    """
+    return _photograph(images.flatten(1).T, directions, config, generator, mask)
+
+
+def _photograph(
+    radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator, mask: Tensor | None
+) -> tuple[Tensor, Tensor, float]:
+    """Photograph radiance (P, F), of the pixels that are wanted or, with a mask (H, W) of these, of all of an image."""
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
     arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
     share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
-    bright = arriving.flatten().sort().values[-1 - math.floor(share * arriving.numel())].clamp(min=1e-6)
+    wanted = slice(None) if mask is None else mask.flatten()
+    metered = arriving[wanted].flatten()
+    bright = metered.sort().values[-1 - math.floor(share * metered.numel())].clamp(min=1e-6)
     exposure = float((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)
-    exposed = (arriving * exposure).clamp(max=1)
+    exposed = arriving * exposure
+    optics = None
+    if mask is not None and uniform() < config.optics_share:
+        optics = draw_optics(generator)
+        exposed = optics.through_lens(exposed.T.reshape(lights, *mask.shape))  # (3, F, H, W)
+    exposed = exposed.clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
         grain = 10 ** uniform(-2.5, -1.2) * (uniform() < _GRAINY_SHARE)
-        exposed = exposed * (1 + grain * torch.randn(exposed.shape, generator=generator)).clamp(min=0)
-        row = add_sensor_noise(exposed.reshape(1, -1), generator)
-        exposed = quantise(row, config.eight_bit_share, generator).view_as(exposed)
+        exposed = exposed * (1 + grain * torch.randn(exposed.shape[-3:], generator=generator)).clamp(min=0)
+        exposed = add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
+    is_jpeg = False
+    if optics is not None:
+        exposed, clipped = optics.develop(exposed), clipped.any(dim=0)
+        is_jpeg = config.sensor_noise and optics.jpeg_quality is not None and uniform() < config.eight_bit_share
+        exposed = (optics.compress(exposed) if is_jpeg else exposed).flatten(1).T[wanted]
+        clipped = clipped.flatten(1).T[wanted]
+    elif mask is not None:
+        exposed, clipped = exposed[wanted], clipped[wanted]
+    if config.sensor_noise and not is_jpeg:
+        exposed = quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
     errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
     if uniform() < _UNMEASURED_SHARE * config.light_intensity_error_share:
@@ -102,10 +137,10 @@ def photograph_scene(
     observed = exposed * errors / intensities
     calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
     if saturated:
-        values = observed.numpy()
+        values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
         observed = torch.from_numpy(values)
-    return observed, calibrated, exposure
+    return observed.contiguous(), calibrated, exposure
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:

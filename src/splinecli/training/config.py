@@ -33,7 +33,7 @@ class TrainingConfig:
     shards: int = 4
     # "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates` steps for
     # NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and trains the error head
-    # alone. "refine_net" fixes all these and trains the last refinement net on pixel sets of rendered scenes.
+    # alone. "refine_net" fixes all these and trains the refinement nets on pixel sets of rendered scenes.
     updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
     ne_net_updates: int = 5
     learning_rate: float = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
@@ -57,6 +57,9 @@ class TrainingConfig:
     angle_weight: float = 1.0
     map_weight: float = 1.0
     masked_weight: float = 1.0
+    # weight of a pixel in the loss of the refinement nets: 1 + gradient_weight times the gradient of the true normals,
+    # in radians per pixel
+    gradient_weight: float = 5.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: float = 0.0
     asymmetric_weight: float = 0.0

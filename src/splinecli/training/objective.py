@@ -148,8 +148,7 @@ def fixed(network: SplineNet, part: Part) -> Iterator[None]:
         "ne_net": ("ne_net.", "set_branch."),
         "li_net": ("li_net.",),
         "error_head": ("ne_net.error_head.",),
-        # A second refinement net learns alone, from the results of the first.
-        "refine_net": ("refine_net.again." if network.config.refines_twice else "refine_net.",),
+        "refine_net": ("refine_net.",),
     }[part]
     fixed = [
         parameter

@@ -25,8 +25,9 @@ from splinecli.refinement.features import Turn, brightness, refine_features, tur
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
+from splinecli.synthesis.optics import scatter
 from splinecli.synthesis.random_numbers import stream_seed
-from splinecli.synthesis.whole_capture import add_background, photograph_scene
+from splinecli.synthesis.whole_capture import add_background, photograph_images
 from splinecli.training.objective import angles, balanced
 
 FIRST_EXAMPLES = 160
@@ -39,7 +40,7 @@ STEPS_PER_EXAMPLE = 4
 MOST_EXAMPLES = 2000
 """More replace the oldest ones. One takes about a megabyte."""
 
-CROP = 128
+CROP = 96
 """Side of the part of a larger map that an example has."""
 
 _ENLARGED_SHARE = 0.6
@@ -49,8 +50,14 @@ _MOST_ENLARGED = 3.0
 _BACKGROUND_SHARE = 0.35
 """A share of the captures shows what lies behind the object; see add_background."""
 
+_DARK_MARGIN = 4
+"""Pixels of darkness around the others, which a lens mixes with the outline."""
+
+_SCATTERING_SHARE = 0.2
+"""A share of the captures of diffuse scenes scatters light below the surface; see scatter."""
+
 _ENGRAVED_SHARE = 0.4
-_ENGRAVED_SIZE = 96
+_ENGRAVED_SIZE = 80
 """A share of the captures show no scene, but an engraved piece of this size; see draw_engraved."""
 
 ERROR_WEIGHT = 0.05
@@ -131,6 +138,9 @@ class ScenePool:
         rows = kept[mask].numpy()
         values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
         maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
+        scatters = torch.rand((), generator=generator) < _SCATTERING_SHARE * self.config.optics_share
+        if scatters and "-diffuse" in entry.name:
+            maps[:-3] = scatter(maps[:-3], mask, generator)
         return self._after_network(maps, lights[chosen], mask, generator)
 
     def _photograph_engraved(self, generator: torch.Generator) -> SceneMaps:
@@ -144,8 +154,10 @@ class ScenePool:
         """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
         if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
-        radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-        observations, lights, _ = photograph_scene(radiance, lights, self.config, generator)
+        else:
+            maps, mask = pad(maps * mask, (_DARK_MARGIN,) * 4), pad(mask, (_DARK_MARGIN,) * 4)
+        truth = torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
+        observations, lights, _ = photograph_images(maps[:-3], mask, lights, self.config, generator)
         features = pixel_features(self.network, observations, lights, mask)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
@@ -248,20 +260,25 @@ class RefinementLosses(NamedTuple):
     angle: Tensor
 
 
-def refinement_losses(network: SplineNet, maps: SceneMaps, *, bfloat16: bool = False) -> RefinementLosses:
+def refinement_losses(
+    network: SplineNet, maps: SceneMaps, *, gradient_weight: float = 0.0, bfloat16: bool = False
+) -> RefinementLosses:
     """Compute the losses of stacked captures.
 
     The mean angle of each capture is divided by the root of its error before refinement: a degree counts more on a
     capture that is nearly right. The likelihood of the errors is that of the error head.
+
+    Args:
+        gradient_weight: see TrainingConfig. Edges and folds are few, and a net that smooths them loses little without.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
         normals, error = network.refine_net(maps.features, maps.mask)
     known = maps.normals.any(dim=1)
-    area = known.sum((1, 2)).clamp(min=1)
+    weights = known * (1 + gradient_weight * _gradient(maps.normals, known))
 
-    def mean_over_capture(values: Tensor) -> Tensor:
-        return (values * known).sum((1, 2)) / area
+    def mean_over_capture(values: Tensor, weights: Tensor = known) -> Tensor:
+        return (values * weights).sum((1, 2)) / weights.sum((1, 2)).clamp(min=1)
 
     def angles_of(estimate: Tensor) -> Tensor:
         return angles(estimate.movedim(1, -1), maps.normals.movedim(1, -1))
@@ -269,7 +286,19 @@ def refinement_losses(network: SplineNet, maps: SceneMaps, *, bfloat16: bool = F
     with torch.no_grad():
         before = mean_over_capture(angles_of(split_features(maps.features)[0]))
     angle = angles_of(normals)
-    after = mean_over_capture(angle)
+    after = mean_over_capture(angle, weights)
     surprise = mean_over_capture(error_negative_log_likelihood(error.movedim(1, -1), angle.detach()))
     total = balanced(after, before) + ERROR_WEIGHT * surprise.mean()
-    return RefinementLosses(total, before.mean(), after.mean())
+    return RefinementLosses(total, before.mean(), mean_over_capture(angle.detach()).mean())
+
+
+def _gradient(normals: Tensor, known: Tensor) -> Tensor:
+    """Return the gradient (B, H, W) of unit normals (B, 3, H, W), in radians per pixel, between known pixels."""
+    squares = torch.zeros_like(known, dtype=normals.dtype)
+    for axis in (1, 2):
+        both = known.narrow(axis, 1, known.shape[axis] - 1) & known.narrow(axis, 0, known.shape[axis] - 1)
+        step = normals.diff(dim=axis + 1).square().sum(dim=1) * both
+        before = pad(step, (1, 0) if axis == 2 else (0, 0, 1, 0))
+        after = pad(step, (0, 1) if axis == 2 else (0, 0, 0, 1))
+        squares += torch.maximum(before, after)
+    return squares.sqrt()
