@@ -2,28 +2,33 @@
 
     python benchmarks/all_figures.py DATA [--results runs/figures] [--only NAME ...] [--again]
 
-DATA has the folders DiLiGenT/pmsData, synth/L17, uw, psbox and merl_nbrdf. Everything together takes hours on two
-cores. Each row is stored in docs/figures.json when it is done, with the version and the weights. Rows of the shipped
-weights, and of fits, which earlier versions may have measured, are not measured again. A stopped evaluation goes on in
---results. --only names measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named,
-because they need a quiet machine.
+DATA has the folders DiLiGenT/pmsData, synth/L17, statues, uw, psbox and merl_nbrdf. Everything together takes hours on
+two cores. Each row is stored in docs/figures.json when it is done, with the version and the weights. Rows of the
+shipped weights, and of fits, which earlier versions may have measured, are not measured again. A stopped evaluation
+goes on in --results. --only names measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they
+are named, because they need a quiet machine.
 """
+
+from __future__ import annotations
 
 import argparse
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import figure_tables as tables
 from figure_tables import FITS, NETWORKS, OBJECTS, SYNTH, Measured
 from splinecli import __version__
+
+if TYPE_CHECKING:
+    from splinecli.inference import NormalEstimate
 
 Cells = dict[str, float | str]
 Rows = dict[str, Callable[[], Cells]]
@@ -90,6 +95,43 @@ class Bench:
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
 
+    def optics(self, convert: Callable[[Any], Any], name: str) -> Cells:
+        """Score the statues after a camera, on all pixels under one draw of ten lights."""
+        captures = {label: self.data / "statues" / label for label in tables.STATUES}
+        copies = {label: rewritten(path, self.results / name, convert) for label, path in captures.items()}
+        cells: Cells = {}
+        for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
+            options = {"trials": 1, "seed": 3, "n_lights": (10,), "max_pixels": None}
+            found = self.errors(f"{name} errors", copies, method, **options)
+            cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
+        return cells
+
+    def slants(self, label: str) -> Cells:
+        """Mean errors of the pixels of each range of true slants, under ten lights."""
+        cells: Cells = {}
+        for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
+            found: dict[str, list[float]] = {}
+            for estimate in self.estimates(self.objects[label], method, trials=2):
+                truth, errors = estimate.capture.ground_truth, estimate.error_map_deg
+                assert truth is not None and errors is not None
+                slant = np.degrees(np.arccos(np.clip(truth[..., 2], -1, 1)))
+                for name, (low, high) in tables.SLANTS.items():
+                    within = (slant >= low) & (slant < high)
+                    found.setdefault(name, []).append(float(np.nanmean(errors[within])))
+            cells |= {f"{name}, {word}": round(fmean(values), 4) for name, values in found.items()}
+        return cells
+
+    def estimates(self, folder: Path, method: str, *, trials: int) -> Iterator[NormalEstimate]:
+        """Yield the estimates of a capture under draws of ten lights."""
+        from splinecli.capture import open_capture
+        from splinecli.capture.lights.draws import draw_lights
+        from splinecli.inference import estimate_normals
+        from splinecli.methods import make_estimator
+
+        source, estimator = open_capture(folder), make_estimator(method)
+        for draw in draw_lights(source.light_directions, 10, trials=trials, seed=0):
+            yield estimate_normals(source.read(draw, as_stored=True), estimator)
+
     def synth_errors(self, capture: str) -> Cells:
         return {
             method: self.errors("synth", {capture: self.synth[capture]}, method)[0]["mae_deg"]
@@ -113,18 +155,8 @@ class Bench:
 
     def confidence(self, capture: str) -> Cells:
         """In percent: pixels within 5 degrees as expected and found; the worst tenth's share in the least sure."""
-        from splinecli.capture import open_capture
-        from splinecli.capture.lights.draws import draw_lights
-        from splinecli.inference import estimate_normals
-        from splinecli.methods import make_estimator
-
-        source, estimator = (
-            open_capture({**self.objects, **self.synth}[capture]),
-            make_estimator("spline-net"),
-        )
         shares = []
-        for draw in draw_lights(source.light_directions, 10, trials=self.trials, seed=0):
-            estimate = estimate_normals(source.read(draw, as_stored=True), estimator)
+        for estimate in self.estimates({**self.objects, **self.synth}[capture], "spline-net", trials=self.trials):
             assert estimate.errors is not None and estimate.error_map_deg is not None
             assert estimate.confidence_map is not None and estimate.expected_under_5 is not None
             known = np.isfinite(estimate.error_map_deg)
@@ -201,6 +233,8 @@ class Bench:
             lambda image: np.round(image / 257).astype("u1"),
             lambda image: (image >> 8).astype("u1"),
         )
+        cameras = {"as rendered": lambda image: image, "Bayer pattern, interpolated": mosaic}
+        cameras |= {f"blurred, sigma {sigma}": partial(blur, sigma) for sigma in (0.5, 0.7, 1.0)}
         bits = {"16 bits": lambda image: image, "rounded to 8 bits": rounded, "cut to 8 bits": cut}
         return {
             "calibration": each(self.calibration, tables.MIRROR_BALLS),
@@ -212,6 +246,8 @@ class Bench:
             "synth": {name: partial(self.synth_errors, name) for name in SYNTH},
             "noise": {m: partial(self.noise, m) for m in (*FITS, *NETWORKS)},
             "eight-bits": {name: partial(self.eight_bits, convert, name) for name, convert in bits.items()},
+            "optics": {name: partial(self.optics, camera, name) for name, camera in cameras.items()},
+            "slants": {label: partial(self.slants, label) for label in OBJECTS},
             "photographs": {name: partial(self.photographs, name) for name in captures},
             "confidence": {name: partial(self.confidence, name) for name in captures},
             "refined-lights": {m: partial(self.refined_lights, m) for m in ("iw12", *NETWORKS)},
@@ -245,11 +281,28 @@ def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
     if not copy.is_dir():
         draft = place / f"{folder.name}.part"
         shutil.copytree(folder, draft, dirs_exist_ok=True)
-        for name in (folder / "filenames.txt").read_text("utf-8").split():
-            image = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
-            cv2.imwrite(str(draft / name), convert(image))
+        named = folder / "filenames.txt"
+        images = (
+            [folder / name for name in named.read_text("utf-8").split()] if named.exists() else folder.glob("0*.png")
+        )
+        for path in images:
+            cv2.imwrite(str(draft / path.name), convert(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
         draft.rename(copy)
     return copy
+
+
+def blur(sigma: float, image: Any) -> Any:
+    """Return a gray image behind a lens that blurs it."""
+    import cv2
+
+    return cv2.GaussianBlur(image, (0, 0), sigma)
+
+
+def mosaic(image: Any) -> Any:
+    """Return a gray image from a sensor with a Bayer pattern that is interpolated."""
+    import cv2
+
+    return cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BayerRG2RGB), cv2.COLOR_RGB2GRAY)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -23,6 +23,17 @@ Measured = dict[str, dict[str, Any]]
 FITS = ("ls", "ls-trimmed", "l1", "iw12", "st14", "ia14")
 NETWORKS = ("spline-net-pixelwise", "spline-net")
 OBJECTS = {"Ball": "ballPNG", "Cat": "catPNG", "Reading": "readingPNG"}
+STATUES = {
+    "bust_diffuse": "bust, matte and glossy",
+    "bust_specular": "bust, specular",
+    "maria_specular": "draped figure",
+}
+CAMERAS = (
+    "as rendered",
+    *(f"blurred, sigma {sigma}" for sigma in (0.5, 0.7, 1.0)),
+    "Bayer pattern, interpolated",
+)
+SLANTS = {"below 60 degrees": (0, 60), "60 to 75 degrees": (60, 75), "above 75 degrees": (75, 91)}
 SYNTH = [f"{shape} {material}" for shape in ("sphere", "relief", "bowl") for material in "SM"]
 PUBLISHED = "published"
 """Figures of papers, for ten lights."""
@@ -137,6 +148,23 @@ TABLES = {
         "images",
         same(("16 bits", "rounded to 8 bits", "cut to 8 bits")),
         {f"{label}, {name}": f"{label} {name}" for label in OBJECTS for name in ("pixelwise", "refined")},
+    ),
+    "optics": Table(
+        ("optics",),
+        "images",
+        same(CAMERAS),
+        {
+            f"{words}, {name}": f"{label} {name}"
+            for label, words in STATUES.items()
+            for name in ("pixelwise", "refined")
+        },
+    ),
+    "slants": Table(
+        ("slants",),
+        "object",
+        same(OBJECTS),
+        same([f"{slant}, {name}" for slant in SLANTS for name in ("pixelwise", "refined")]),
+        "{:.1f}",
     ),
     "overexposed": Table(("photographs",), "object", same((*OBJECTS, *SYNTH)), same(EXPOSED)),
     "intensities": Table(("photographs",), "object", same((*OBJECTS, *SYNTH)), same(INTENSITIES)),
