@@ -33,7 +33,7 @@ from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import draw_patches
 from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn
-from splinecli.synthesis.whole_capture import photograph_scene
+from splinecli.synthesis.whole_capture import photograph_images
 
 Floats = NDArray[np.floating]
 
@@ -182,9 +182,11 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
         unequal = 0.0 if kind in ("intensities", "curve") else 0.3
         config = CaptureConfig(
             light_direction_error_share=0, light_intensity_error_share=0.2 * noisy, unequal_lights_share=unequal,
-            saturated_share=0.1, sensor_noise=noisy, eight_bit_share=0.3,
+            saturated_share=0.1, sensor_noise=noisy, eight_bit_share=0.3, optics_share=0.5,
         )  # fmt: skip
-        seen, *_ = photograph_scene(radiance.float(), torch.from_numpy(single), config, generator)
+        images = torch.zeros(len(lights), *mask.shape)
+        images[:, torch.from_numpy(mask)] = radiance.float().T
+        seen, *_ = photograph_images(images, torch.from_numpy(mask), torch.from_numpy(single), config, generator)
         observations = np.asarray(seen.numpy(), np.float32)
         stated = lights
         if kind == "curve":

@@ -19,7 +19,7 @@ from splinecli.training import refinement, tasks
 from splinecli.training.config import PRESETS, TrainingConfig
 from splinecli.training.defaults import WEIGHTS
 from splinecli.training.loop import Trainer
-from splinecli.training.refinement import STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
+from splinecli.training.refinement import STEPS_PER_EXAMPLE, SceneMaps, ScenePool, refinement_losses, stack_maps
 from splinecli.training.tasks import RefinementTask
 
 CPU = torch.device("cpu")
@@ -108,7 +108,8 @@ def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.Monk
     monkeypatch.setattr(refinement, "_BACKGROUND_SHARE", 0.0)
     return replace(
         tiny, network=replace(tiny.network, error_head=True, refines=True), sources={str(bumpy_set.folder): 1.0},
-        pixels=replace(tiny.pixels, optics_share=0.0), updates="refine_net", batch_size=2, shards=1, steps=60, learning_rate=1e-3, average_decay=0.0,
+        pixels=replace(tiny.pixels, optics_share=0.0), updates="refine_net", batch_size=2, shards=1, steps=60,
+        learning_rate=1e-3, average_decay=0.0,
     )  # fmt: skip
 
 
@@ -217,3 +218,24 @@ def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: 
 def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="rendered scenes"):
         Trainer(replace(refining, sources={"generator": 1.0}), tmp_path, CPU)
+
+
+def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: TrainingConfig) -> None:
+    """A plate in steps, all of it tilted as under wrong lights, or with its steps smoothed. The net changes nothing."""
+    network = network_of(refining)
+    slopes = torch.zeros(2, 24, 24)
+    slopes[0, :, 12:] = 0.5
+
+    def unit_of(slopes: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
+
+    def losses_of(estimate: torch.Tensor) -> list[float]:
+        features = torch.zeros(1, CHANNELS, 24, 24)
+        features[0, :3] = estimate
+        maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))
+        return [refinement_losses(network, maps, detail_weight=weight).total.item() for weight in (0.0, 10.0)]
+
+    tilted, smoothed = unit_of(slopes + 0.3), unit_of(torch.nn.functional.avg_pool2d(slopes, 5, 1, 2))
+    for estimate, most, least in ((tilted, 0.4, 0.0), (smoothed, 9.0, 0.5)):
+        without, with_detail = losses_of(estimate)
+        assert least < (with_detail - without) / without < most

@@ -22,7 +22,7 @@ from splinecli.synthesis.optics import draw_optics
 from splinecli.synthesis.random_numbers import draw_number
 
 _BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one from which the exposure is chosen
-_GRAINY_SHARE = 2 / 3
+_GRAINY_SHARE = 1 / 3
 _MOST_SATURATED = 0.03  # largest share of clipped observations in an overexposed capture
 _UNMEASURED_SHARE = 0.3
 _MOST_UNMEASURED = 0.5
@@ -75,7 +75,7 @@ def photograph_scene(
 
     The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
-    the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a
+    the observations are clipped, and restored as `infer` does. A third of the captures with sensor noise also have a
     grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where images are
     shifted by a part of a pixel or light arrives from neighbours. Of the captures with errors of the intensities, 30 %
     have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many

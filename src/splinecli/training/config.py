@@ -57,9 +57,8 @@ class TrainingConfig:
     angle_weight: float = 1.0
     map_weight: float = 1.0
     masked_weight: float = 1.0
-    # weight of a pixel in the loss of the refinement nets: 1 + gradient_weight times the gradient of the true normals,
-    # in radians per pixel
-    gradient_weight: float = 5.0
+    # weight of the error of the differences between neighbours beside the angle, for the refinement nets
+    detail_weight: float = 1.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: float = 0.0
     asymmetric_weight: float = 0.0

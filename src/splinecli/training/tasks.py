@@ -187,8 +187,8 @@ class RefinementTask:
             self.generator.manual_seed(stream_seed(self.config.seed, step, shard))
             maps = self.pool.draw(self.config.batch_size // self.config.shards, self.generator)
             with fixed(network, "refine_net"):
-                weight = self.config.gradient_weight
-                found = refinement_losses(network, maps.to(self.device), gradient_weight=weight, bfloat16=bfloat16)
+                weight = self.config.detail_weight
+                found = refinement_losses(network, maps.to(self.device), detail_weight=weight, bfloat16=bfloat16)
             yield Losses(found.total, found.angle, missing, missing, missing, missing)
 
     @torch.no_grad()
