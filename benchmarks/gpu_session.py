@@ -2,9 +2,9 @@
 
 python benchmarks/gpu_session.py OUT [--data DATA] [--minutes M] [--device cuda] [--size full]
 
-Each step is a process of its own with a limit of time, and the others go on where one fails. OUT/report.json and
-report.txt are written after each step. Rendering ends after RENDERED_SHARE of the time, and training has the rest.
-Only the standard library is imported here, so the report also says what could not be installed.
+Each step is a process with a limit of time, and the others go on where one fails. OUT/report.json and report.txt are
+written after each. Rendering ends after RENDERED_SHARE of the time, and training has the rest. Only the standard
+library is imported here, so the report also says what could not be installed.
 """
 
 import argparse
@@ -26,12 +26,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-MEDALLION = ROOT / "examples/medallion"
+MEDALLION = str(Path(__file__).resolve().parents[1] / "examples/medallion")
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "scipy", "pyamg", "trimesh", "embreex", "distributed")
-RENDERED_SHARE = 0.55  # of the time, when rendering ends
+RENDERED_SHARE = 0.55
 LEAST_RENDERED_SHARE = 0.1  # of the time, for rendering after slow steps
-SPARE_SECONDS = 15  # of training's time, to validate and save at its end
+SPARE_SECONDS = 15  # of training, to validate and save at its end
 LEAST_SECONDS = 5  # of a step; it is left out where less is left
 STOP_SECONDS = 15  # that an interrupted process has to clean up
 
@@ -40,10 +39,9 @@ Row = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """What is measured."""
+    """How much is measured."""
 
     megapixels: tuple[float, ...]
-    network_pixels: int  # for the speed of the pixelwise network
     methods: tuple[str, ...]  # that are evaluated
     steps: int  # of each comparison of training
     captures: int  # that a comparison of the refinement nets photographs first
@@ -51,31 +49,24 @@ class Size:
 
 
 SIZES = {
-    "full": Size((6, 24), 1 << 16, ("all",), 20, 12, ("--size", "128", "--n-lights", "100")),
-    "small": Size((0.05, 0.2), 1 << 10, ("spline-net", "ia14"), 4, 2, ("--size", "32", "--n-lights", "16")),
+    "full": Size((6, 24), ("all",), 20, 12, ("--size", "128", "--n-lights", "100")),
+    "small": Size((0.01, 0.02), ("ia14",), 3, 2, ("--size", "32", "--n-lights", "16")),
 }
-
-
-# Steps in a process of their own
 
 
 def machine() -> Row:
     """Return versions and hardware."""
-    found: Row = {"python": platform.python_version(), "cores": len(os.sched_getaffinity(0))}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = None
     import torch
 
     from splinecli.system.devices import choose_precision
 
+    installed = {each.name: each.version for each in metadata.distributions()}
+    found: Row = {"python": platform.python_version(), **{name: installed.get(name) for name in PACKAGES}}
+    found["cores"] = len(os.sched_getaffinity(0))
     found["processor"] = f"{torch.backends.cpu.get_cpu_capability()}, {choose_precision('auto', torch.device('cpu'))}"
-    found["gpu"] = None
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
-        found["gpu"] = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
+        found["gpu"] = f"{properties.name}, {properties.total_memory >> 30} GiB, CUDA {torch.version.cuda}"
     return found
 
 
@@ -84,24 +75,7 @@ def splinecli(*arguments: str) -> None:
     from splinecli.cli.main import main
 
     if code := main(arguments):
-        raise RuntimeError(f"splinecli {' '.join(arguments)} ended with exit code {code}")
-
-
-def infer(capture: str, out: str, device: str, runs: int) -> Row:
-    """Return speed and memory of the last of several runs of `infer` in one process: the first one loads CUDA."""
-    for _ in range(runs):
-        splinecli("infer", capture, "-o", out, "--device", device, "--overwrite", "--quiet")
-    report = json.loads((Path(out) / Path(capture).name / "report.json").read_text("utf-8"))
-    seconds, errors = report["seconds"], report["angular_error_deg"]
-    computed = sum(seconds[stage] for stage in ("distil", "estimate", "indirect_light", "refine"))
-    return {
-        "pixels": report["n_pixels"],
-        "pixels_per_second": round(report["n_pixels"] / computed),
-        "mae_deg": errors and errors["mean"],
-        "distillation": report["distillation"],
-        "seconds": seconds,
-        "peak_gpu_mib": peak_gpu_mib(),
-    }
+        raise RuntimeError(f"splinecli {arguments[0]} ended with exit code {code}")
 
 
 def peak_gpu_mib() -> int:
@@ -109,6 +83,17 @@ def peak_gpu_mib() -> int:
     import torch
 
     return torch.cuda.max_memory_reserved() >> 20 if torch.cuda.is_available() else 0
+
+
+def infer(capture: str, out: str, device: str, runs: int) -> Row:
+    """Return speed and memory of the last of several runs of `infer` in one process: the first one loads CUDA."""
+    for _ in range(runs):
+        splinecli("infer", capture, "-o", out, "--device", device, "--overwrite", "--quiet")
+    report = json.loads((Path(out) / Path(capture).name / "report.json").read_text("utf-8"))
+    seconds = report["seconds"]
+    computed = sum(seconds[stage] for stage in ("distil", "estimate", "indirect_light", "refine"))
+    found = {"pixels": report["n_pixels"], "pixels_per_second": round(report["n_pixels"] / computed)}
+    return {**found, "seconds": seconds, "distillation": report["distillation"], "peak_gpu_mib": peak_gpu_mib()}
 
 
 def normals_apart(first: str, second: str) -> Row:
@@ -123,44 +108,20 @@ def normals_apart(first: str, second: str) -> Row:
     return {"mean_deg": float(angle_deg.mean()), "max_deg": float(angle_deg.max())}
 
 
-def network_speed(device: str, pixels: int) -> Row:
-    """Return pixels per second of the pixelwise network under ten lights, for batches of several sizes."""
-    import torch
-
-    from splinecli.methods import MethodOptions, make_estimator
-    from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
-
-    config = PixelGeneratorConfig(min_lights=10, max_lights=10)
-    batch = PixelGenerator(config, torch.Generator().manual_seed(0)).draw(pixels)
-    observations, lights = batch.observations.numpy(), batch.light_directions[0].double().numpy()
-    found: Row = {}
-    for batch_size in (256, 1024, 4096, 16384):
-        options = MethodOptions(device=device, batch_size=batch_size)
-        estimator = make_estimator("spline-net-pixelwise", options)
-        for _ in range(2):
-            started = time.perf_counter()
-            estimator.estimate(observations, lights)
-            found[f"batches of {batch_size}"] = round(pixels / (time.perf_counter() - started))
-    return {**found, "peak_gpu_mib": peak_gpu_mib()}
-
-
-def mean_errors(captures: Sequence[str], out: str, device: str, methods: Sequence[str]) -> dict[str, float]:
+def mean_errors(captures: Sequence[str], out: str, device: str, methods: Sequence[str]) -> Row:
     """Return the mean angular error in degrees by method and capture."""
     chosen = [word for method in methods for word in ("--method", method)]
     limits = ("--trials", "1", "--max-pixels", "2000", "--device", device)
     splinecli("evaluate", *captures, *chosen, *limits, "-o", out, "--quiet")
     results = json.loads((Path(out) / "results.json").read_text("utf-8"))["results"]
-    return {f"{result['method']}, {result['capture']}": result["mae_deg"] for result in results}
+    return {f"{result['method']} on {result['capture']}": result["mae_deg"] for result in results}
 
 
-def train_steps(
-    preset: str, changes: Sequence[Row], device: str, steps: int, captures: int, *, same_batches: bool
-) -> Row:
-    """Return the losses and the times of some steps of a preset.
+def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, same_batches: bool) -> Row:
+    """Return losses and times of some steps of a preset.
 
-    Args:
-        captures: that are photographed before the first step.
-        same_batches: whether the pixels are drawn on the processor, whose random numbers differ from the GPU's.
+    With `same_batches`, pixels are drawn on the processor, because the GPU has other random numbers. Captures are
+    always photographed with the processor's.
     """
     import torch
 
@@ -169,7 +130,7 @@ def train_steps(
     from splinecli.training.config_files import configure
     from splinecli.training.loop import Trainer
 
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = captures, 1
+    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1
     config, place = configure(preset, None, list(changes)), choose_device(device)
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
@@ -179,31 +140,22 @@ def train_steps(
             draw = tasks.PixelTask(config, trainer.shards, torch.device("cpu")).draw
             trainer.task.draw = lambda step: moved(draw(step), place)  # type: ignore[method-assign]
         losses, seconds = [], []
-        for _ in range(steps):
+        for _ in range(size.steps):
             started = time.perf_counter()
             losses.append(float(trainer.step()[0]))
             seconds.append(time.perf_counter() - started)
-    later = seconds[1:]  # the first one loads CUDA
-    return {
-        "losses": losses,
-        "steps_per_second": 1 / statistics.mean(later),
-        "median_step_seconds": statistics.median(later),
-        "prepare_seconds": prepared,
-        "peak_gpu_mib": peak_gpu_mib(),
-    }
+    mean, median = statistics.mean(seconds[1:]), statistics.median(seconds[1:])  # the first step loads CUDA
+    speed = {"steps_per_second": 1 / mean, "median_step_seconds": median, "prepare_seconds": prepared}
+    return {**speed, "losses": losses, "peak_gpu_mib": peak_gpu_mib()}
 
 
 def moved(value: Any, device: Any) -> Any:
     """Return a batch with all its tensors on a device."""
-    import torch
-
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
     if isinstance(value, list | tuple):
         return type(value)(moved(part, device) for part in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.replace(value, **{name: moved(part, device) for name, part in vars(value).items()})
-    return value
+    return value.to(device) if hasattr(value, "to") else value
 
 
 def finish_set(folder: str) -> Row:
@@ -211,17 +163,14 @@ def finish_set(folder: str) -> Row:
     from splinecli.pixel_sets.writer import PixelSetWriter
 
     entries = PixelSetWriter(Path(folder)).finish().entries
-    scenes = len({entry.scene for entry in entries})
-    if scenes < 2:
-        raise RuntimeError(f"{scenes} scenes are rendered; training and validation need one each")
-    return {"entries": len(entries), "shapes": scenes, "pixels": sum(entry.n_pixels for entry in entries)}
+    shapes = len({entry.scene for entry in entries})
+    if shapes < 2:
+        raise RuntimeError(f"{shapes} shapes are rendered; training and validation need one each")
+    return {"entries": len(entries), "shapes": shapes, "pixels": sum(entry.n_pixels for entry in entries)}
 
 
 def train(pixel_set: str, run: str, device: str, ends: float, seconds_per_capture: float) -> Row:
-    """Train the refinement nets until `ends`, a time of time.time(), and return the last metrics.
-
-    Photographing the first captures takes half of the time at most.
-    """
+    """Train the refinement nets until `ends`, in Unix time. Photographing first takes half of the time at most."""
     from splinecli.training import tasks
     from splinecli.training.run_log import read_metrics
 
@@ -234,18 +183,8 @@ def train(pixel_set: str, run: str, device: str, ends: float, seconds_per_captur
     splinecli("train", pixel_set, "--preset", "refine", "--device", device, "--minutes", f"{minutes:.2f}", "-o", run)
     rows = read_metrics(Path(run) / "metrics.csv")
     checked = [row.validation_deg for row in rows if row.validation_deg is not None]
-    return {
-        "minutes": minutes,
-        "first_captures": tasks.FIRST_EXAMPLES,
-        "steps": rows[-1].step,
-        "loss": rows[-1].loss,
-        "angle_deg": rows[-1].angle_deg,
-        "validation_deg": checked,
-        "peak_gpu_mib": peak_gpu_mib(),
-    }
-
-
-# The session
+    found = {"minutes": minutes, "first_captures": tasks.FIRST_EXAMPLES, "steps": rows[-1].step, "loss": rows[-1].loss}
+    return {**found, "angle_deg": rows[-1].angle_deg, "validation_deg": checked, "peak_gpu_mib": peak_gpu_mib()}
 
 
 class Session:
@@ -253,71 +192,70 @@ class Session:
 
     def __init__(self, out: Path, work: Path, ends: float) -> None:
         self.out, self.work, self.ends = out, work, ends
-        self.steps: list[Row] = []
+        self.entries: list[Row] = []
 
-    @property
-    def left(self) -> float:
-        """Seconds that are left."""
-        return self.ends - time.time()
+    def step(self, name: str, call: Callable[..., Row], *arguments: Any, seconds: float | None = None) -> Row | None:
+        """Add the result of a call to the report and return it, or None if it failed.
 
-    def step(self, name: str, call: Callable[..., Row], *arguments: Any, **keywords: Any) -> Row | None:
-        """Add the result of a call to the report and return it, or None if it failed."""
+        With a limit of seconds, it is called in a process of its own; see `child`.
+        """
         started = time.time()
         entry: Row = {"step": name}
         try:
-            entry["result"] = call(*arguments, **keywords)
+            entry["result"] = call(*arguments) if seconds is None else self.child(call, *arguments, seconds=seconds)
         except Exception as error:
             entry["error"] = f"{type(error).__name__}: {error}"
         entry["seconds"] = round(time.time() - started, 1)
-        self.steps.append(entry)
-        (self.out / "report.json").write_text(json.dumps(self.steps, indent=1) + "\n", "utf-8")
-        text = "".join(map(as_text, self.steps))
-        (self.out / "report.txt").write_text(text, "utf-8")
+        self.entries.append(entry)
+        (self.out / "report.json").write_text(json.dumps(self.entries, indent=1) + "\n", "utf-8")
+        (self.out / "report.txt").write_text("".join(map(as_text, self.entries)), "utf-8")
         print(as_text(entry), end="", flush=True)
         return entry.get("result")
 
-    def child(self, call: Callable[..., Any], *arguments: Any, seconds: float, **keywords: Any) -> Any:
+    def child(self, call: Callable[..., Row | None], *arguments: Any, seconds: float) -> Any:
         """Return the result of a call in a process of its own.
 
         Raises TimeoutError after some seconds, at the latest at the session's end; RuntimeError if the call fails.
         """
-        context, log = get_context("spawn"), self.work / "log.txt"
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_answer, args=(sender, str(log), call, arguments, keywords))
-        seconds = min(seconds, self.left)
+        seconds = min(seconds, self.ends - time.time())
         if seconds < LEAST_SECONDS:
             raise TimeoutError("there is no time left")
+        context, log = get_context("spawn"), self.work / "log.txt"
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_answer, args=(sender, str(log), call, arguments))
         process.start()
         sender.close()
-        answered = False
+        answered = receiver.poll(seconds)
         try:
-            if not receiver.poll(seconds):
-                raise TimeoutError(f"stopped after {seconds:.0f} seconds")
-            answered = True
-            problem, result = receiver.recv()
+            problem, result = receiver.recv() if answered else (None, None)
         except EOFError:
-            problem, result = f"the process ended with exit code {process.exitcode}", None
-        finally:
-            process.join(STOP_SECONDS if answered else 0)
-            if process.is_alive():
-                os.kill(process.pid or 0, signal.SIGINT)
-                process.join(STOP_SECONDS)
-                process.kill()
-                process.join()
+            problem, result = "the process died", None
+        process.join(STOP_SECONDS if answered else 0)
+        if process.is_alive():
+            os.kill(process.pid or 0, signal.SIGINT)
+            process.join(STOP_SECONDS)
+            process.kill()
+        if not answered:
+            raise TimeoutError(f"stopped after {seconds:.0f} seconds")
         if problem:
-            raise RuntimeError("\n".join((problem, *log.read_text("utf-8", "replace").splitlines()[-12:])))
+            raise RuntimeError("\n".join((problem, *last_lines(log))))
         return result
 
 
-def _answer(sender: Connection, log: str, call: Callable[..., Any], arguments: Any, keywords: Any) -> None:
+def _answer(sender: Connection, log: str, call: Callable[..., Any], arguments: Sequence[Any]) -> None:
     """Send (problem, result) of a call, whose output goes to a log."""
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(file, 1)
-    os.dup2(file, 2)
+    for stream in (1, 2):
+        os.dup2(file, stream)
     try:
-        sender.send((None, call(*arguments, **keywords)))
+        sender.send((None, call(*arguments)))
     except Exception as error:
         sender.send((f"{type(error).__name__}: {error}", None))
+
+
+def last_lines(log: Path) -> list[str]:
+    """Return the last lines of a log, if there is one."""
+    return log.read_text("utf-8", "replace").splitlines()[-12:] if log.exists() else []
 
 
 def as_text(entry: Row) -> str:
@@ -338,67 +276,52 @@ def _words(value: Any) -> str:
     return "  ".join(map(_words, value)) if isinstance(value, list) else str(value)
 
 
-def compare_devices(session: Session, size: Size, device: str, statues: Sequence[str]) -> None:
-    """Compare inference and evaluation on the device and on the processor."""
+def compare_inference(session: Session, size: Size, device: str, captures: Sequence[str]) -> None:
+    """Compare `infer` and `evaluate` on the device and on the processor, and measure large captures on the device."""
     from large_captures import write_capture
 
-    enlarged = {megapixels: session.work / f"relief-{megapixels}" for megapixels in size.megapixels}
-    for folder in enlarged.values():
-        folder.mkdir()
+    large = {session.work / f"relief-{megapixels}": megapixels for megapixels in size.megapixels}
+    places = {device: device, "processor": "cpu"}
     with ThreadPoolExecutor() as threads:
-        written = [threads.submit(write_capture, folder, megapixels) for megapixels, folder in enlarged.items()]
-        outs = {place: str(session.work / f"infer-{place}") for place in (f"device {device}", "processor")}
-        for (place, out), name in zip(outs.items(), (device, "cpu"), strict=True):
-            session.step(f"infer medallion, {place}", session.child, infer, str(MEDALLION), out, name, 2, seconds=90)
-        maps = [f"{out}/medallion/normals.npy" for out in outs.values()]
-        session.step("angle between the normal maps", session.child, normals_apart, *maps, seconds=30)
-        session.step("network, pixels/s", session.child, network_speed, device, size.network_pixels, seconds=60)
+        for folder in large:
+            folder.mkdir()
+        written = [*map(threads.submit, [write_capture] * len(large), *zip(*large.items(), strict=True))]
+        for name, place in places.items():
+            out = str(session.work / f"infer-{name}")
+            session.step(f"infer medallion, {name}", infer, MEDALLION, out, place, 2, seconds=90)
+        maps = [str(session.work / f"infer-{name}/medallion/normals.npy") for name in places]
+        session.step("angle between the normal maps", normals_apart, *maps, seconds=30)
         errors = []
-        for name in (device, "cpu"):
-            out = tempfile.mkdtemp(dir=session.work)
-            arguments = ([str(MEDALLION), *statues], out, name, size.methods)
-            errors.append(session.step(f"evaluate, {name}", session.child, mean_errors, *arguments, seconds=90))
-        session.step("evaluate, difference of the MAE in degrees", differences, *errors)
-        for folder, writing in zip(enlarged.values(), written, strict=True):
+        for name, place in places.items():
+            how = captures, str(session.work / f"evaluate-{name}"), place, size.methods
+            errors.append(session.step(f"evaluate, {name}", mean_errors, *how, seconds=90) or {})
+        common = {name: errors[0][name] - errors[1][name] for name in errors[0] if name in errors[1]}
+        session.step("evaluate, difference of the MAE in degrees", lambda: common)
+        for folder, writing in zip(large, written, strict=True):
             writing.result()
             out = str(session.work / "infer-large")
-            session.step(f"infer {folder.name}", session.child, infer, str(folder), out, device, 1, seconds=120)
-
-
-def differences(first: dict[str, float] | None, second: dict[str, float] | None) -> dict[str, float]:
-    """Return the first numbers minus the second ones."""
-    if first is None or second is None:
-        raise RuntimeError("an evaluation failed")
-    return {name: first[name] - second[name] for name in first}
+            session.step(f"infer {folder.name}", infer, str(folder), out, device, 1, seconds=120)
 
 
 def compare_training(session: Session, size: Size, device: str, preset: str, sources: Sequence[Row]) -> Row | None:
     """Compare steps of a preset on the device and on the processor; return the device's row, None if it failed."""
     exact = [*sources, {"precision": "float32"}]
-    runs = {
-        "processor, float32": ("cpu", exact, True),
-        f"{device}, float32, the same batches": (device, exact, True),
-        device: (device, [*sources], False),
-    }
     found = {
-        name: session.step(
-            f"train {preset}, {name}",
-            session.child,
-            train_steps,
-            *(preset, changes, place, size.steps, size.captures),
-            same_batches=same,
-            seconds=75,
-        )
-        for name, (place, changes, same) in runs.items()
+        name: session.step(f"train {preset}, {name}", train_steps, preset, *how, seconds=75)
+        for name, how in {
+            "processor, float32": (exact, "cpu", size, True),
+            f"{device}, float32, the same batches": (exact, device, size, True),
+            device: (list(sources), device, size, False),
+        }.items()
     }
-    rows = {name: row for name, row in found.items() if row is not None}
-    losses = zip(*(row["losses"] for row in rows.values()), strict=True)
-    session.step(f"train {preset}, losses", lambda: {"of": list(rows), "loss": [list(each) for each in losses]})
+    columns = {name: row["losses"] for name, row in found.items() if row is not None}
+    losses = [list(each) for each in zip(*columns.values(), strict=True)]
+    session.step(f"train {preset}, losses", lambda: {"columns": [list(columns)], "loss": losses})
     return found[device]
 
 
 def scenes_to_render(data: Path | None, size: Size) -> list[str]:
-    """Return the options of `prepare`: views of the meshes, or random scenes without any. More than there is time for.
+    """Return options of `prepare` for more scenes than there is time for: views of meshes, or without any random ones.
 
     Shapes of the statues are left out, because they are for measuring: statues/maria_specular is one of shapes/maria.
     """
@@ -407,15 +330,17 @@ def scenes_to_render(data: Path | None, size: Size) -> list[str]:
     meshes = [path for path in sorted(data.glob("shapes/*.ply")) if not path.name.startswith(statues)] if data else []
     if data is None or not meshes:
         return [*options, "--scenes", "200"]
-    relief = [word for path in sorted(data.glob("relief/*.jpg")) for word in ("--relief", str(path))]
-    return [*options, "--views", "8", *(word for path in meshes for word in ("--mesh", str(path))), *relief]
+    files = {"--mesh": meshes, "--relief": sorted(data.glob("relief/*.jpg"))}
+    words = [word for name, paths in files.items() for path in paths for word in (name, str(path))]
+    return [*options, "--views", "8", *words]
 
 
-def render(session: Session, options: Sequence[str], pixel_set: Path, seconds: float) -> Row:
+def render(session: Session, options: Sequence[str], pixel_set: str, seconds: float) -> Row:
     """Render scenes for some seconds, and finish the set with those that are complete."""
     with suppress(TimeoutError):
-        session.child(splinecli, "prepare", *options, "-o", str(pixel_set), "--quiet", seconds=seconds)
-    return session.child(finish_set, str(pixel_set), seconds=30)
+        session.child(splinecli, "prepare", *options, "-o", pixel_set, "--quiet", seconds=seconds)
+    found: Row = session.child(finish_set, pixel_set, seconds=30)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -428,32 +353,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", choices=SIZES, default="full")
     parser.add_argument("--work", type=Path, help="a folder for what is not kept, with the log of the installation")
     options = parser.parse_args(arguments)
-    size, device = SIZES[options.size], options.device
+    size, device, total = SIZES[options.size], options.device, 60 * options.minutes
     data = Path(options.data) if options.data else None
     work = options.work or Path(tempfile.mkdtemp())
     options.out.mkdir(parents=True, exist_ok=True)
-    session = Session(options.out, work, options.started + 60 * options.minutes)
-    log = work / "install.log"
-    lines = log.read_text("utf-8", "replace").splitlines()[-12:] if log.exists() else []
-    session.step("install", lambda: {"until now": f"{time.time() - options.started:.0f} s", "log": [*map(str, lines)]})
-    found = session.step("machine", session.child, machine, seconds=60)
-    if found is None or (device == "cuda" and found["gpu"] is None):
-        print("PyTorch finds no GPU: nothing else can be measured", file=sys.stderr)
+    session = Session(options.out, work, options.started + total)
+    log = {"seconds": time.time() - options.started, "log": [[line] for line in last_lines(work / "install.log")]}
+    session.step("install", lambda: log)
+    found = session.step("machine", machine, seconds=60)
+    if found is None or (device == "cuda" and "gpu" not in found):
+        print("PyTorch finds no GPU: nothing else is measured", file=sys.stderr)
         return 1
-    statues = [*map(str, sorted(data.glob("statues/*")))] if data else []
-    compare_devices(session, size, device, statues)
+    compare_inference(session, size, device, [MEDALLION, *map(str, sorted(data.glob("statues/*")) if data else ())])
     compare_training(session, size, device, "compact", [])
-    total = 60 * options.minutes
-    rendered = max(LEAST_RENDERED_SHARE * total, session.left - (1 - RENDERED_SHARE) * total)
-    pixel_set = work / "scenes"
-    scenes = scenes_to_render(data, size)
-    if session.step("render scenes", render, session, scenes, pixel_set, rendered) is not None:
-        row = compare_training(session, size, device, "refine", [{"sources": {str(pixel_set): 1.0}}])
-        seconds = row["prepare_seconds"] / (size.captures + 1) if row else 1.0
-        run = str(options.out / "refine")
-        places = (str(pixel_set), run, device, session.ends, seconds)
-        session.step("train the refinement nets", session.child, train, *places, seconds=session.left)
-    return int(any("error" in step for step in session.steps))
+    pixel_set, run = str(work / "scenes"), str(options.out / "refine")
+    rendered = max(LEAST_RENDERED_SHARE * total, session.ends - time.time() - (1 - RENDERED_SHARE) * total)
+    if session.step("render scenes", render, session, scenes_to_render(data, size), pixel_set, rendered):
+        row = compare_training(session, size, device, "refine", [{"sources": {pixel_set: 1.0}}])
+        per_capture = row["prepare_seconds"] / (size.captures + 1) if row else 1.0
+        session.step("train", train, pixel_set, run, device, session.ends, per_capture, seconds=total)
+    return int(any("error" in entry for entry in session.entries))
 
 
 if __name__ == "__main__":
