@@ -41,6 +41,7 @@ Row = dict[str, Any]
 class Size:
     """How much is measured."""
 
+    runs: int  # of `infer` on a small capture; CUDA is loaded in the first one
     megapixels: tuple[float, ...]
     methods: tuple[str, ...]  # that are evaluated
     steps: int  # of each comparison of training
@@ -49,8 +50,8 @@ class Size:
 
 
 SIZES = {
-    "full": Size((6, 24), ("all",), 20, 12, ("--size", "128", "--n-lights", "100")),
-    "small": Size((0.01, 0.02), ("ia14",), 3, 2, ("--size", "32", "--n-lights", "16")),
+    "full": Size(2, (6, 24), ("all",), 20, 12, ("--size", "128", "--n-lights", "100")),
+    "small": Size(1, (0.01, 0.02), ("ia14",), 2, 1, ("--size", "32", "--n-lights", "16")),
 }
 
 
@@ -86,7 +87,7 @@ def peak_gpu_mib() -> int:
 
 
 def infer(capture: str, out: str, device: str, runs: int) -> Row:
-    """Return speed and memory of the last of several runs of `infer` in one process: the first one loads CUDA."""
+    """Return speed and memory of the last of some runs of `infer` in one process."""
     for _ in range(runs):
         splinecli("infer", capture, "-o", out, "--device", device, "--overwrite", "--quiet")
     report = json.loads((Path(out) / Path(capture).name / "report.json").read_text("utf-8"))
@@ -94,6 +95,16 @@ def infer(capture: str, out: str, device: str, runs: int) -> Row:
     computed = sum(seconds[stage] for stage in ("distil", "estimate", "indirect_light", "refine"))
     found = {"pixels": report["n_pixels"], "pixels_per_second": round(report["n_pixels"] / computed)}
     return {**found, "seconds": seconds, "distillation": report["distillation"], "peak_gpu_mib": peak_gpu_mib()}
+
+
+def infer_large(megapixels: float, work: str, device: str) -> Row:
+    """Return speed and memory of `infer` on a capture of this size."""
+    from large_captures import write_capture
+
+    folder = Path(work) / f"relief-{megapixels}"
+    folder.mkdir()
+    write_capture(folder, megapixels)
+    return infer(str(folder), work, device, 1)
 
 
 def normals_apart(first: str, second: str) -> Row:
@@ -220,7 +231,7 @@ class Session:
         seconds = min(seconds, self.ends - time.time())
         if seconds < LEAST_SECONDS:
             raise TimeoutError("there is no time left")
-        context, log = get_context("spawn"), self.work / "log.txt"
+        context, log = get_context("spawn"), self.work / f"{call.__name__}.txt"
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(target=_answer, args=(sender, str(log), call, arguments))
         process.start()
@@ -238,7 +249,8 @@ class Session:
         if not answered:
             raise TimeoutError(f"stopped after {seconds:.0f} seconds")
         if problem:
-            raise RuntimeError("\n".join((problem, *last_lines(log))))
+            lines = log.read_text("utf-8", "replace").splitlines()
+            raise RuntimeError("\n".join((problem, *lines[-12:])))
         return result
 
 
@@ -253,9 +265,10 @@ def _answer(sender: Connection, log: str, call: Callable[..., Any], arguments: S
         sender.send((f"{type(error).__name__}: {error}", None))
 
 
-def last_lines(log: Path) -> list[str]:
-    """Return the last lines of a log, if there is one."""
-    return log.read_text("utf-8", "replace").splitlines()[-12:] if log.exists() else []
+def problems(log: Path) -> list[list[str]]:
+    """Return what could not be installed, from the log of gpu_session.sh."""
+    lines = log.read_text("utf-8", "replace").splitlines() if log.exists() else []
+    return [[line] for line in lines if line.startswith("not installed")]
 
 
 def as_text(entry: Row) -> str:
@@ -277,30 +290,22 @@ def _words(value: Any) -> str:
 
 
 def compare_inference(session: Session, size: Size, device: str, captures: Sequence[str]) -> None:
-    """Compare `infer` and `evaluate` on the device and on the processor, and measure large captures on the device."""
-    from large_captures import write_capture
-
-    large = {session.work / f"relief-{megapixels}": megapixels for megapixels in size.megapixels}
+    """Compare `infer` and `evaluate` on the device and on the processor."""
     places = {device: device, "processor": "cpu"}
-    with ThreadPoolExecutor() as threads:
-        for folder in large:
-            folder.mkdir()
-        written = [*map(threads.submit, [write_capture] * len(large), *zip(*large.items(), strict=True))]
-        for name, place in places.items():
-            out = str(session.work / f"infer-{name}")
-            session.step(f"infer medallion, {name}", infer, MEDALLION, out, place, 2, seconds=90)
-        maps = [str(session.work / f"infer-{name}/medallion/normals.npy") for name in places]
-        session.step("angle between the normal maps", normals_apart, *maps, seconds=30)
-        errors = []
-        for name, place in places.items():
-            how = captures, str(session.work / f"evaluate-{name}"), place, size.methods
-            errors.append(session.step(f"evaluate, {name}", mean_errors, *how, seconds=90) or {})
-        common = {name: errors[0][name] - errors[1][name] for name in errors[0] if name in errors[1]}
-        session.step("evaluate, difference of the MAE in degrees", lambda: common)
-        for folder, writing in zip(large, written, strict=True):
-            writing.result()
-            out = str(session.work / "infer-large")
-            session.step(f"infer {folder.name}", infer, str(folder), out, device, 1, seconds=120)
+    for name, place in places.items():
+        out = str(session.work / f"infer-{name}")
+        session.step(f"infer medallion, {name}", infer, MEDALLION, out, place, size.runs, seconds=90)
+    maps = [str(session.work / f"infer-{name}/medallion/normals.npy") for name in places]
+    session.step("angle between the normal maps", normals_apart, *maps, seconds=30)
+    # In a process that has done no other linear algebra: https://github.com/pytorch/pytorch/issues/90613
+    first = [MEDALLION], str(session.work / "evaluate-ia14"), device, ("ia14",)
+    session.step(f"evaluate ia14 alone, {device}", mean_errors, *first, seconds=60)
+    errors = []
+    for name, place in places.items():
+        how = captures, str(session.work / f"evaluate-{name}"), place, size.methods
+        errors.append(session.step(f"evaluate, {name}", mean_errors, *how, seconds=90) or {})
+    common = {name: errors[0][name] - errors[1][name] for name in errors[0] if name in errors[1]}
+    session.step("evaluate, difference of the MAE in degrees", lambda: common)
 
 
 def compare_training(session: Session, size: Size, device: str, preset: str, sources: Sequence[Row]) -> Row | None:
@@ -335,10 +340,16 @@ def scenes_to_render(data: Path | None, size: Size) -> list[str]:
     return [*options, "--views", "8", *words]
 
 
+def prepare(options: Sequence[str], pixel_set: str) -> None:
+    """Render scenes, and leave the cores to others that need them."""
+    os.nice(10)
+    splinecli("prepare", *options, "-o", pixel_set, "--quiet")
+
+
 def render(session: Session, options: Sequence[str], pixel_set: str, seconds: float) -> Row:
     """Render scenes for some seconds, and finish the set with those that are complete."""
     with suppress(TimeoutError):
-        session.child(splinecli, "prepare", *options, "-o", pixel_set, "--quiet", seconds=seconds)
+        session.child(prepare, options, pixel_set, seconds=seconds)
     found: Row = session.child(finish_set, pixel_set, seconds=30)
     return found
 
@@ -358,8 +369,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     work = options.work or Path(tempfile.mkdtemp())
     options.out.mkdir(parents=True, exist_ok=True)
     session = Session(options.out, work, options.started + total)
-    log = {"seconds": time.time() - options.started, "log": [[line] for line in last_lines(work / "install.log")]}
-    session.step("install", lambda: log)
+    installed = {"seconds": time.time() - options.started, "problems": problems(work / "install.log")}
+    session.step("install", lambda: installed)
     found = session.step("machine", machine, seconds=60)
     if found is None or (device == "cuda" and "gpu" not in found):
         print("PyTorch finds no GPU: nothing else is measured", file=sys.stderr)
@@ -368,7 +379,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compare_training(session, size, device, "compact", [])
     pixel_set, run = str(work / "scenes"), str(options.out / "refine")
     rendered = max(LEAST_RENDERED_SHARE * total, session.ends - time.time() - (1 - RENDERED_SHARE) * total)
-    if session.step("render scenes", render, session, scenes_to_render(data, size), pixel_set, rendered):
+    with ThreadPoolExecutor(1) as thread:
+        rendering = thread.submit(render, session, scenes_to_render(data, size), pixel_set, rendered)
+        for megapixels in size.megapixels:
+            name = f"infer {megapixels} megapixels, {device}, while scenes are rendered"
+            session.step(name, infer_large, megapixels, str(work), device, seconds=150)
+        scenes = session.step(f"render scenes, {rendered:.0f} s", rendering.result)
+    if scenes is not None:
         row = compare_training(session, size, device, "refine", [{"sources": {pixel_set: 1.0}}])
         per_capture = row["prepare_seconds"] / (size.captures + 1) if row else 1.0
         session.step("train", train, pixel_set, run, device, session.ends, per_capture, seconds=total)
