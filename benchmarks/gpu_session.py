@@ -144,9 +144,7 @@ def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, sa
     tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1
     config, place = configure(preset, None, list(changes)), choose_device(device)
     with tempfile.TemporaryDirectory() as folder:
-        started = time.perf_counter()
         trainer = Trainer(config, Path(folder), place)
-        prepared = time.perf_counter() - started
         if same_batches and isinstance(trainer.task, tasks.PixelTask):
             draw = tasks.PixelTask(config, trainer.shards, torch.device("cpu")).draw
             trainer.task.draw = lambda step: moved(draw(step), place)  # type: ignore[method-assign]
@@ -155,9 +153,15 @@ def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, sa
             started = time.perf_counter()
             losses.append(float(trainer.step()[0]))
             seconds.append(time.perf_counter() - started)
-    mean, median = statistics.mean(seconds[1:]), statistics.median(seconds[1:])  # the first step loads CUDA
-    speed = {"steps_per_second": 1 / mean, "median_step_seconds": median, "prepare_seconds": prepared}
-    return {**speed, "losses": losses, "peak_gpu_mib": peak_gpu_mib()}
+        found: Row = {"losses": losses}
+        if isinstance(trainer.task, tasks.RefinementTask):
+            started = time.perf_counter()
+            for _ in range(3):
+                trainer.task.pool.add()
+            found["capture_seconds"] = (time.perf_counter() - started) / 3
+    found["steps_per_second"] = 1 / statistics.mean(seconds[1:])  # the first step loads CUDA
+    found["median_step_seconds"] = statistics.median(seconds[1:])
+    return {**found, "peak_gpu_mib": peak_gpu_mib()}
 
 
 def moved(value: Any, device: Any) -> Any:
@@ -180,22 +184,26 @@ def finish_set(folder: str) -> Row:
     return {"entries": len(entries), "shapes": shapes, "pixels": sum(entry.n_pixels for entry in entries)}
 
 
-def train(pixel_set: str, run: str, device: str, ends: float, seconds_per_capture: float) -> Row:
-    """Train the refinement nets until `ends`, in Unix time. Photographing first takes half of the time at most."""
+def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: float) -> Row:
+    """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of it at most."""
     from splinecli.training import tasks
-    from splinecli.training.run_log import read_metrics
+    from splinecli.training.config_files import configure
+    from splinecli.training.loop import open_run
+
+    def minutes_left() -> float:
+        return max(0.05, (ends - SPARE_SECONDS - time.time()) / 60)
 
     usual, held = tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES
-    left = ends - SPARE_SECONDS - time.time()
-    share = min(1.0, left / 2 / (seconds_per_capture * (usual + held)))
+    share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
     tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (max(1, round(share * number)) for number in (usual, held))
-    photographing = seconds_per_capture * (tasks.FIRST_EXAMPLES + tasks.VALIDATION_SCENES)
-    minutes = max(0.05, (left - photographing) / 60)
-    splinecli("train", pixel_set, "--preset", "refine", "--device", device, "--minutes", f"{minutes:.2f}", "-o", run)
-    rows = read_metrics(Path(run) / "metrics.csv")
-    checked = [row.validation_deg for row in rows if row.validation_deg is not None]
-    found = {"minutes": minutes, "first_captures": tasks.FIRST_EXAMPLES, "steps": rows[-1].step, "loss": rows[-1].loss}
-    return {**found, "angle_deg": rows[-1].angle_deg, "validation_deg": checked, "peak_gpu_mib": peak_gpu_mib()}
+    config = configure("refine", None, [{"sources": {pixel_set: 1.0}, "minutes": minutes_left()}])
+    with open_run(config, Path(run), device, resume=False, tensorboard=False, warn=print, say=print) as trainer:
+        # How long photographing takes is known only now.
+        trainer.config = dataclasses.replace(config, minutes=minutes_left())
+        last = trainer.run()
+    assert last is not None
+    found = {"first_captures": tasks.FIRST_EXAMPLES, "training_minutes": trainer.config.minutes}
+    return {**found, **dataclasses.asdict(last), "peak_gpu_mib": peak_gpu_mib()}
 
 
 class Session:
@@ -387,8 +395,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenes = session.step(f"render scenes, {rendered:.0f} s", rendering.result)
     if scenes is not None:
         row = compare_training(session, size, device, "refine", [{"sources": {pixel_set: 1.0}}])
-        per_capture = row["prepare_seconds"] / (size.captures + 1) if row else 1.0
-        session.step("train", train, pixel_set, run, device, session.ends, per_capture, seconds=total)
+        capture_seconds = row["capture_seconds"] if row else 1.0
+        session.step("train", train, pixel_set, run, device, session.ends, capture_seconds, seconds=total)
     return int(any("error" in entry for entry in session.entries))
 
 
