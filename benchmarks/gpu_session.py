@@ -17,6 +17,7 @@ import statistics
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -258,7 +259,7 @@ class Session:
             raise TimeoutError(f"stopped after {seconds:.0f} seconds")
         if problem:
             lines = log.read_text("utf-8", "replace").splitlines()
-            raise RuntimeError("\n".join((problem, *lines[-12:])))
+            raise RuntimeError("\n".join((problem, *lines[-30:])))
         return result
 
 
@@ -270,6 +271,7 @@ def _answer(sender: Connection, log: str, call: Callable[..., Any], arguments: S
     try:
         sender.send((None, call(*arguments)))
     except Exception as error:
+        traceback.print_exc()
         sender.send((f"{type(error).__name__}: {error}", None))
 
 
