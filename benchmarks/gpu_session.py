@@ -378,7 +378,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     data = Path(options.data) if options.data else None
     work = options.work or Path(tempfile.mkdtemp())
     options.out.mkdir(parents=True, exist_ok=True)
-    session = Session(options.out, work, options.started + total)
+    session = Session(options.out, work, options.started + total - STOP_SECONDS)
     installed = {"seconds": time.time() - options.started, "problems": problems(work / "install.log")}
     session.step("install", lambda: installed)
     found = session.step("machine", machine, seconds=60)
