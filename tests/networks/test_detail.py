@@ -29,7 +29,8 @@ def photographed(truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: 
     errors = noise * torch.randn(SIDE**2, len(lights), generator=generator)
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
     normals = (truth if seen is None else seen).flatten(1).T
-    features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, alternating_signs(lights))
+    signs = alternating_signs(lights)
+    features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, signs, torch.zeros(2))
     return features.T.reshape(CHANNELS, SIDE, SIDE)
 
 

@@ -19,6 +19,7 @@ WIDTHS = {
     "n_lights": 1,  # logarithm
     "halves": 3,  # how two halves of the lights differ; the sign means nothing. See fits/two_halves.py
     "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of refinement/detail.py
+    "sharpness": 2,  # of the images of the capture, the same for all pixels; see refinement/sharpness.py
 }
 """The features and their numbers of channels. Vectors have x and y first."""
 

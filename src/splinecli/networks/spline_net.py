@@ -85,7 +85,9 @@ class SplineNet(nn.Module):
         if config.set_width:
             fits = 1 + len(config.fits)
             self.set_branch = SetBranch(config.set_width, config.set_layers, fits, sees_capture=config.sees_capture)
-        self.refine_net = RefineNet(twice=config.refines_twice) if config.refines else None
+        self.refine_net: RefineNet | None = None
+        if config.refines:
+            self.refine_net = RefineNet(twice=config.refines_twice, reads_sharpness=config.reads_sharpness)
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)

@@ -21,7 +21,13 @@ _HALVES_SCALE = 3.0  # brings these small numbers near the others
 
 @torch.no_grad()
 def refine_features(
-    observations: Tensor, light_directions: Tensor, normals: Tensor, error: Tensor, reference: float, signs: Tensor
+    observations: Tensor,
+    light_directions: Tensor,
+    normals: Tensor,
+    error: Tensor,
+    reference: float,
+    signs: Tensor,
+    sharpness: Tensor,
 ) -> Tensor:
     """Return the features (P, CHANNELS) of pixels in the order of WIDTHS, each about -1 to 1.
 
@@ -32,6 +38,7 @@ def refine_features(
         error: (P, 2), see networks/error_head.py.
         reference: the brightness of the capture, see `brightness`.
         signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
+        sharpness: (2,), of the capture, see refinement/sharpness.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -64,6 +71,7 @@ def refine_features(
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (_HALVES_SCALE * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
+        "sharpness": sharpness.expand(len(observed), -1),
     }
     return torch.cat([features[name] for name in WIDTHS], dim=1)
 

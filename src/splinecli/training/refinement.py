@@ -22,6 +22,7 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
+from splinecli.refinement.sharpness import image_sharpness
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
@@ -219,11 +220,12 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     assert errors is not None, "TrainingConfig asks for an error head"
     lights = light_directions.to(estimator.device)
     signs, reference = alternating_signs(lights), brightness(observations)
+    sharpness = image_sharpness(mask.numpy(), observations.numpy()).to(lights.device)
 
     def features_of(rows: Rows) -> Tensor:
         values = light_of(rows).observations, estimated[rows], errors[rows]
         seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
-        return refine_features(seen, lights, normals, error, reference, signs)
+        return refine_features(seen, lights, normals, error, reference, signs, sharpness)
 
     return torch.cat([features_of(rows) for rows in parts_of_rows(len(observations))])
 
