@@ -141,10 +141,10 @@ def test_a_near_camera_under_distant_lights(run, bump: Path) -> None:
     assert "camera       perspective, focal length 40 pixels" in run("info", "bump").out
     given = infer(run, "--camera-matrix", "camera.txt", "--crop", "4,2,20,24")
     assert given["camera_matrix"] == [[40, 0, 12.5], [0, 40, 13.5], [0, 0, 1]]
-    scored = json.loads(run("evaluate", "bump", "--method", "st14", "--n-lights", "all", "--json").out)["results"][0]
-    assert scored["mae_deg"] == pytest.approx(mean_error(run, "--method", "st14"), abs=1e-3)
+    scored = json.loads(run("evaluate", "bump", "--method", "ia14", "--n-lights", "all", "--json").out)["results"][0]
+    assert scored["mae_deg"] == pytest.approx(mean_error(run, "--method", "ia14"), abs=1e-3)
     (bump / "camera_matrix.txt").unlink()
-    assert scored["mae_deg"] != pytest.approx(mean_error(run, "--method", "st14"), abs=1e-3)
+    assert scored["mae_deg"] != pytest.approx(mean_error(run, "--method", "ia14"), abs=1e-3)
     for text, problem in (("1 2\n3 4\n", "found 2 x 2 numbers, expected 3 x 3"), ("-1 0 0\n0 1 0\n0 0 1\n", "not a")):
         Path("camera.txt").write_text(text)
         refused = run("infer", "bump", "--method", "ls", "--camera-matrix", "camera.txt", "-o", "new")
