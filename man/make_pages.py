@@ -28,8 +28,9 @@ FILES = {
     " filenames.txt. Camera RAW files need 'splinecli[raw]'.",
     "CAPTURE/light_directions.txt": "A line x y z for each image: x right, y up, z to the camera.",
     "CAPTURE/*.lp, lights.json": "Instead: lights with the names of their images, from RTI or AliceVision.",
-    "CAPTURE/light_positions.txt, pixel_size.txt, camera_matrix.txt": "Near lamps: positions from the middle of the"
-    " image on the object, the width of a pixel in their unit, and the camera matrix in pixels. Optional.",
+    "CAPTURE/light_positions.txt, pixel_size.txt": "Near lamps: positions from the middle of the image on the object,"
+    " and the width of a pixel in their unit. Optional.",
+    "CAPTURE/camera_matrix.txt": "The camera matrix in pixels. Optional: without it, the camera is orthographic.",
     "CAPTURE/light_intensities.txt": "A line r g b for each image. Optional.",
     "CAPTURE/mask.png": "White on the object (above half of its largest value). Optional: without it, every pixel"
     " belongs to the object.",

@@ -31,6 +31,7 @@ def estimate_normals(
     light_intensities: ArrayLike | None = None,
     first_light: str | float | None = None,
     pixel_size: float | None = None,
+    camera_matrix: ArrayLike | None = None,
     method: str = "spline-net",
     as_stored: bool = False,
     white_level: float | None = None,
@@ -65,6 +66,8 @@ def estimate_normals(
             object without outline.
         pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
             lamps in the same unit, from the middle of the image on the object's mean plane.
+        camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is near, compared with the object's width. The
+            light directions are then in the frame of its axis. None is an orthographic camera.
         method: "spline-net", "spline-net-pixelwise", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
         as_stored: use the values of the images alone. By default, saturated observations are restored and unknown
             light intensities are estimated.
@@ -121,6 +124,7 @@ def estimate_normals(
         mask,
         light_intensities=light_intensities,
         pixel_size=pixel_size,
+        camera_matrix=camera_matrix,
         white_level=white_level,
         as_stored=as_stored,
         find_lights=find,

@@ -173,9 +173,9 @@ def capture_features(
         return None
     values = light.observations[kept].astype(np.float64)
     values /= values.max(axis=1, keepdims=True)
-    own = light.in_frame_of_pixels(normals[rows])[kept].astype(np.float64)
+    own = normals[rows][kept].astype(np.float64)
     if light.directions.ndim == 3:
-        values = _as_distant(values, light.directions[kept], lights)
+        values = _as_distant(values, light.in_frame_of_capture(light.directions)[kept], lights)
     lit = (values > LIT_SHARE).astype(np.float64)
     shaded = (lit * values).sum(axis=1).clip(min=LIT_SHARE)
 

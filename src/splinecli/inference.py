@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
-from splinecli.light.indirect_light import IndirectLight, find_indirect_light
+from splinecli.light.indirect_light import IndirectLight, PixelPlaces, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
 from splinecli.methods.near_light import find_surface
+from splinecli.surface.camera import rays_at
 from splinecli.system.memory import return_freed_memory
 from splinecli.system.progress import Progress
 
@@ -117,7 +118,7 @@ def _estimate(
     found = estimate_pixels(
         capture.mask,
         capture.observations,
-        lambda indirect, rows: light_on(capture, rows, without=indirect),
+        light_on(capture),
         estimator,
         tile_pixels,
         progress,
@@ -207,14 +208,22 @@ def _no_stage(_: str) -> AbstractContextManager[Progress]:
     return nullcontext(lambda _: None)
 
 
-def light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:
-    """Return the observations and the light directions of some of a capture's pixels."""
-    observations = capture.observations[rows]
-    if without is not None:
-        observations = without.remove(observations, rows)
-    if capture.lamps is None:
-        return LampLight(observations, capture.light_directions)
-    return LampLight.of(observations, capture.lamps.choose_pixels(rows))
+def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
+    """Return what gives the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
+    lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
+    pixels = PixelPlaces(capture.mask)
+
+    def light_without(indirect: IndirectLight | None, rows: Rows) -> LampLight:
+        observations = capture.observations[rows]
+        if indirect is not None:
+            observations = indirect.remove(observations, rows)
+        if lamps is not None:
+            return LampLight.of(observations, lamps.choose_pixels(rows))
+        if camera_matrix is None:
+            return LampLight(observations, directions)
+        return LampLight.distant(observations, directions, rays_at(*pixels.places(rows), camera_matrix))
+
+    return light_without
 
 
 def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:

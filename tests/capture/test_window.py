@@ -11,6 +11,7 @@ import pytest
 from splinecli.capture import open_capture
 from splinecli.capture.window import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.inference import light_on
 from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -122,6 +123,22 @@ def test_near_lamps_light_a_part_as_they_light_the_whole(crop, scale, perspectiv
         lights.append(image)
     whole, part = lights
     np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
+def test_a_near_camera_sees_a_part_as_it_sees_the_whole(crop, scale, tmp_path):
+    matrix = tmp_path / "camera.txt"
+    matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
+    images = []
+    for options in ((None, None), (crop, scale)):
+        record = InferOptions(crop=options[0], scale=options[1], camera_matrix=str(matrix))
+        capture = record.open(MEDALLION).read(as_stored=True)
+        directions = light_on(capture)(None, np.arange(capture.n_pixels)).directions
+        image = np.zeros((*capture.mask.shape, *directions.shape[1:]))
+        image[capture.mask] = directions
+        images.append(image)
+    whole, part = images
+    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
 
 
 def test_the_width_of_a_part_is_not_that_of_the_object() -> None:

@@ -6,6 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
+
+from scenes import spiral_lights
 
 
 def files_below(folder: Path) -> list[str]:
@@ -38,6 +41,21 @@ def test_the_same_as_json(run, capture):
     assert report["warnings"] == [
         "All lights are within 30 degrees of the camera axis; lower lights give better normals."
     ]
+
+
+def test_the_camera_of_exif(run, tmp_path):
+    """A lens of 50 mm on film of 43.3 mm across the diagonal, before 36 x 24 mm in 360 x 240 pixels."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 50
+    (tmp_path / "photographs").mkdir()
+    for number in range(4):
+        Image.new("L", (360, 240), 40 + 20 * number).save(tmp_path / f"photographs/{number}.jpg", exif=exif)
+    np.savetxt(tmp_path / "photographs/light_directions.txt", spiral_lights(4))
+    report = json.loads(run("info", tmp_path / "photographs", "--json").out)
+    assert report["camera_matrix"] is None
+    assert report["exif_camera_matrix"] == [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]]
+    words = "counts as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500 119.5, 0 0 1"
+    assert f"camera       {words}" in run("info", tmp_path / "photographs").out
 
 
 def test_a_part_of_the_pixels_gives_the_same_report(run, capture, monkeypatch):

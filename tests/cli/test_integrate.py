@@ -171,6 +171,7 @@ VIEWS = {
     "crop": "--crop 4,2,16,18 --pixel-size 0.5",
     "stiffness": "--stiffness 0",
     "near": "--light-positions lamps.txt --pixel-size 2",
+    "near camera": "--scale 1/2 --camera-matrix camera.txt",
     "perspective": "--light-positions lamps.txt --pixel-size 2 --camera-matrix camera.txt",
 }
 
@@ -313,6 +314,8 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
         ("", "options", {}),
         ("", "files", ["normals.npy", 5]),
         ("", "file_sizes", 7),
+        ("", "camera_matrix", [[0, 0, 0]] * 3),
+        ("", "camera_matrix", 1),
         ("", "near_lamps", {"camera": "perspective", "camera_matrix": [[0, 0, 0]] * 3}),
         ("", "near_lamps", {"camera": "perspective"}),
         ("", "near_lamps", 1),

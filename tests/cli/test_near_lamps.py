@@ -124,6 +124,33 @@ def test_wrong_files_are_named(run, near: Path) -> None:
         (near / name).unlink()
 
 
+def test_a_near_camera_under_distant_lights(run, bump: Path) -> None:
+    """The camera is in the report, and comes from the option or the folder. A changed matrix changes the capture."""
+    np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
+    orthographic = infer(run)
+    assert orthographic["camera_matrix"] is None
+    matrix = np.array([(40, 0, 16.5), (0, 40, 15.5), (0, 0, 1)])
+    np.savetxt("camera.txt", matrix)
+    np.savetxt(bump / "camera_matrix.txt", matrix)
+    assert "other input files" in run("infer", "bump", "--method", "ls").err
+    found = infer(run)
+    check(found, "report")
+    assert (found["camera_matrix"], found["near_lamps"]) == (matrix.tolist(), None)
+    assert found["inputs_sha256"] != orthographic["inputs_sha256"]
+    assert found["angular_error_deg"] == orthographic["angular_error_deg"]
+    assert "camera       perspective, focal length 40 pixels" in run("info", "bump").out
+    given = infer(run, "--camera-matrix", "camera.txt", "--crop", "4,2,20,24")
+    assert given["camera_matrix"] == [[40, 0, 12.5], [0, 40, 13.5], [0, 0, 1]]
+    scored = json.loads(run("evaluate", "bump", "--method", "ia14", "--n-lights", "all", "--json").out)["results"][0]
+    assert scored["mae_deg"] == pytest.approx(mean_error(run, "--method", "ia14"), abs=1e-3)
+    (bump / "camera_matrix.txt").unlink()
+    assert scored["mae_deg"] != pytest.approx(mean_error(run, "--method", "ia14"), abs=1e-3)
+    for text, problem in (("1 2\n3 4\n", "found 2 x 2 numbers, expected 3 x 3"), ("-1 0 0\n0 1 0\n0 0 1\n", "not a")):
+        Path("camera.txt").write_text(text)
+        refused = run("infer", "bump", "--method", "ls", "--camera-matrix", "camera.txt", "-o", "new")
+        assert (refused.code, problem in refused.err) == (3, True), refused.err
+
+
 def test_a_file_of_lobes(run, near: Path) -> None:
     """One line is for all lamps. The frame of the positions is that of the lobes, too."""
     without = infer(run)

@@ -1,4 +1,4 @@
-"""Near lamps: analytic surfaces under points of light, by Lambert's law and the inverse square of the distance."""
+"""Near lamps and near cameras: analytic surfaces under points of light, by the inverse square of the distance."""
 
 from dataclasses import replace
 
@@ -11,6 +11,7 @@ from scenes import spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.window import Window
+from splinecli.errors import InputError, UsageError
 from splinecli.inference import estimate_normals
 from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator, near_light
@@ -131,6 +132,64 @@ def test_a_perspective_camera() -> None:
     # Depth is known up to its geometric mean, which is not exactly the depth of the middle.
     assert error_deg(replace(capture, lamps=lamps)) < 0.3
     assert error_deg(replace(capture, lamps=replace(lamps, camera_matrix=None))) > 1
+
+
+def glossy_sphere(half_angle_deg: float, *, gloss: float = 1.0, side: int = 32) -> Capture:
+    """A sphere that fills the picture of a pinhole camera, under distant lights: Lambert's law and Blinn-Phong's."""
+    focal, middle = side / 2 / np.tan(np.radians(half_angle_deg)), (side - 1) / 2
+    matrix = np.array([(focal, 0, middle), (0, focal, middle), (0, 0, 1)])
+    rays = unit(pixel_rays(np.ones((side, side), np.bool_), matrix))
+    distance = 1 / np.sin(np.radians(half_angle_deg))
+    along = -rays[:, 2] * distance  # of a ray, to the point next to the centre
+    hit = along**2 > (distance**2 - 1) * (1 + 1e-4 / distance**2)
+    rays, along = rays[hit], along[hit]
+    reached = along - np.sqrt(along**2 - distance**2 + 1)
+    normals = unit(reached[:, None] * rays + (0, 0, distance))
+    half = unit(LIGHTS - rays[:, None])
+    cosine = np.clip(normals @ LIGHTS.T, 0, None)
+    highlight = np.clip(np.einsum("pfc,pc->pf", half, normals), 0, None) ** 30 * (cosine > 0)
+    mask, truth = hit.reshape(side, side), np.zeros((side, side, 3), np.float32)
+    truth[mask] = normals
+    seen = (0.5 * (cosine + gloss * highlight)).astype(np.float32)
+    return Capture("sphere", seen, LIGHTS, tuple(range(10)), mask, truth, camera_matrix=matrix)
+
+
+def test_the_shipped_network_sees_gloss_from_a_near_camera() -> None:
+    """Refined, too: without the camera, the highlights are where an orthographic one would not see them."""
+    capture, estimator = glossy_sphere(20, side=20), make_estimator("spline-net")
+    found = estimate_normals(capture, estimator)
+    without = estimate_normals(replace(capture, camera_matrix=None), estimator)
+    assert found.errors.mean < 1
+    assert found.errors.mean < 0.6 * without.errors.mean
+
+
+def test_least_squares_does_not_depend_on_the_camera() -> None:
+    capture, estimator = glossy_sphere(20), make_estimator("ls")
+    maps = [estimate_normals(each, estimator).normal_map for each in (capture, replace(capture, camera_matrix=None))]
+    np.testing.assert_allclose(*maps, atol=1e-4)
+    matte = estimate_normals(glossy_sphere(20, gloss=0), make_estimator("iw12"))
+    assert matte.errors.median < 0.1  # shadows at the rim
+
+
+def test_a_camera_far_away_is_orthographic() -> None:
+    """At this focal length, rays differ by 0.002 degrees."""
+    capture, estimator = glossy_sphere(0.001, side=20), make_estimator("spline-net-pixelwise")
+    maps = [estimate_normals(each, estimator).normal_map for each in (capture, replace(capture, camera_matrix=None))]
+    np.testing.assert_allclose(*maps, atol=2e-3)
+
+
+def test_the_python_door_takes_a_camera() -> None:
+    capture = glossy_sphere(20, side=16)
+    images = np.zeros((10, *capture.mask.shape), np.float32)
+    images[:, capture.mask] = capture.observations.T
+    arguments = images, LIGHTS, capture.mask
+    found = splinecli.estimate_normals(*arguments, camera_matrix=capture.camera_matrix, method="st14")
+    expected = estimate_normals(capture, make_estimator("st14")).normal_map
+    np.testing.assert_allclose(found.normal_map, expected, atol=1e-5)
+    assert np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max() > 0.01
+    for matrix, error in ((np.eye(2), UsageError), (-np.eye(3), InputError)):
+        with pytest.raises(error, match="camera matrix"):
+            splinecli.estimate_normals(*arguments, camera_matrix=matrix, method="ls")
 
 
 @pytest.mark.parametrize(("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)])

@@ -66,9 +66,7 @@ def find_view(image: ImageFacts, matrix: Path | None) -> View:
     height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
     if matrix is not None:
-        given = read_camera_matrix(matrix)
-        ray_basis(given)  # refuses other numbers
-        return View(given, "--camera-matrix", shortest)
+        return View(read_camera_matrix(matrix), "--camera-matrix", shortest)
     found = _focal_length(image.exif or {}, width, height)
     focal = found or DISTANT
     given = np.array(((focal, 0, (width - 1) / 2), (0, focal, (height - 1) / 2), (0, 0, 1.0)))

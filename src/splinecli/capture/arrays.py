@@ -26,6 +26,7 @@ def capture_from_arrays(
     *,
     light_intensities: ArrayLike | None = None,
     pixel_size: float | None = None,
+    camera_matrix: ArrayLike | None = None,
     white_level: float | None = None,
     as_stored: bool = False,
     find_lights: LightFinder | None = None,
@@ -42,6 +43,7 @@ def capture_from_arrays(
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
         pixel_size: for near lamps, the width of a pixel on the object; light_directions are then positions in this
             unit, from the middle of the image on the object's mean plane. None for distant lights.
+        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
             integer images; floating-point images then have none.
         as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
@@ -82,12 +84,14 @@ def capture_from_arrays(
         observations = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)[0]
     indices, level = tuple(range(n_lights)), saturation.white_level
     capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
-    capture = replace(capture, estimated_colours=colours)
+    matrix = None if camera_matrix is None else np.asarray(camera_matrix, np.float64)
+    capture = replace(capture, estimated_colours=colours, camera_matrix=matrix)
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
-        lamps = NearLamps.of(positions, pixel_size, shape, equal=not known)
-        capture = replace(capture, lamps=lamps, warnings=(*warnings, *check_distances(lamps, inside, None)))
+        lamps = NearLamps.of(positions, pixel_size, shape, equal=not known, camera_matrix=matrix)
+        warnings = [*warnings, *check_distances(lamps, inside, None)]
+        capture = replace(capture, lamps=lamps, camera_matrix=None, warnings=tuple(warnings))
     stored = StoredCapture(capture, saturation, intensities_known=known)
     if light_directions is None and find_lights is not None:
         stored = stored.find_lights(find_lights)

@@ -16,7 +16,7 @@ from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overr
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import positions_as_directions
-from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions, find_lamps
+from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions, find_camera, find_lamps
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import LightForm, RowForm
@@ -60,7 +60,7 @@ def open_capture(
         white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
             is found from the files and their values (see white_level.py).
         lights_format: whether the rows of a light file of text are vectors or angles.
-        lamps: where near lamps are, if no files in the folder say so.
+        lamps: where near lamps are, and the camera, if no files in the folder say so.
         find_lights: finds the lights from the images, in place of light files.
 
     Raises:
@@ -87,7 +87,8 @@ def open_capture(
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
-    stamp = stamp_files(files, radiometry.flat_field, () if near is None else near.stamp)
+    camera_matrix, of_camera = find_camera(Path(folder), near, lamps)
+    stamp = stamp_files(files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera))
     in_folder = files.images
     files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
     if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
@@ -134,6 +135,7 @@ def open_capture(
         intensities_measured=found_intensities is not None,
         light_frame=light_frame,
         lamps=near,
+        camera_matrix=camera_matrix,
         window=window.on(facts[0]),
         find_lights=find_lights,
         # Left out where they are not given, so that earlier stamps stay valid.

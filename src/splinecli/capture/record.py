@@ -13,6 +13,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
+from splinecli.surface.camera import ray_basis
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
@@ -28,13 +29,14 @@ _DTYPES = {
     "estimated_intensities": np.float64,
     "estimated_colours": np.float64,
     "restored": np.bool_,
+    "camera_matrix": np.float64,
 }
 _BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy of a large capture
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One object under F lights, seen by a fixed orthographic camera. It is validated when it is made.
+    """One object under F lights, seen by a fixed camera. It is validated when it is made.
 
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
@@ -58,10 +60,14 @@ class Capture:
             else None.
         lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
             image on the object's mean plane. None for distant lights.
+        camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic camera. Near lamps
+            have their own.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
-            horizon, there are fewer than three lights or all lie in one plane, or the mask is empty.
+            horizon, there are fewer than three lights or all lie in one plane, the mask is empty, or the numbers of the
+            camera matrix are not those of one.
+        UsageError: the camera matrix is not 3 x 3.
     """
 
     name: str
@@ -77,6 +83,7 @@ class Capture:
     white_level: WhiteLevel | None = None
     lamps: NearLamps | None = None
     light_errors_deg: Doubles | None = None
+    camera_matrix: Doubles | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -88,6 +95,8 @@ class Capture:
         self._check_lights()
         self._check_observations()
         self._check_ground_truth()
+        if self.camera_matrix is not None:
+            ray_basis(self.camera_matrix)
 
     @property
     def n_lights(self) -> int:

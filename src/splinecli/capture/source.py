@@ -63,6 +63,7 @@ class CaptureSource:
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
     lamps: LampFiles | None = None  # what is known of near lamps, or None
+    camera_matrix: Doubles | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
     # JSON values that change when a file that is read for the capture, or the given white level, does. They are older
@@ -143,6 +144,9 @@ class CaptureSource:
             warnings=tuple(warnings),
             white_level=saturation.white_level,
             lamps=None if lamps is None else lamps.choose_lights(indices),
+            camera_matrix=None
+            if lamps is not None or self.camera_matrix is None
+            else self.window.camera(self.camera_matrix),
         )
         stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)

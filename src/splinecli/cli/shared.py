@@ -225,7 +225,8 @@ OBJECT_WIDTH = Option(
 CAMERA_MATRIX = Option(
     None,
     metavar="FILE",
-    help="Near lamps: the camera matrix in pixels. [default: camera_matrix.txt in CAPTURE, or orthographic]",
+    help="Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is then estimated in the"
+    " frame of its viewing ray. [default: camera_matrix.txt in CAPTURE, or orthographic]",
 )
 MASK = Option(None, metavar="FILE", help=f"{MASK_IMAGE.format('object')} [default: a file named mask.*, or all pixels]")
 CROP = Option(None, metavar="X,Y,W,H", help="Read this box of the images: left upper corner and size in pixels.")

@@ -45,8 +45,9 @@ def capture_figures(
 ) -> list[CaptureFigure]:
     """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
-    Under near lamps, there is none of pixels. All pixels in the mask are estimated, also where the protocol has
-    max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
+    Under near lamps, or with a camera matrix, there is none of pixels. All pixels in the mask are estimated, also where
+    the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has
+    no ground truth.
 
     Args:
         name: name of the capture in the tables.
@@ -75,8 +76,8 @@ def capture_figures(
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
     network = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
-    # Under near lamps, each pixel has light directions of its own.
-    if network is not None and capture.lamps is None:
+    # Under near lamps, or before a near camera, each pixel has light directions of its own.
+    if network is not None and capture.lamps is None and capture.camera_matrix is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
         png = _observation_maps(whole, capture, network, errors_deg[network.name], pixels, title=title)
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."

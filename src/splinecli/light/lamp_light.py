@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import focal_length, ray_basis
+from splinecli.surface.camera import focal_length, ray_basis, rays_at
 
 Floats = NDArray[np.floating]
 
@@ -27,7 +27,7 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
         middle_row, middle_column = lamps.middle
         points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
     else:
-        rays = np.stack((columns, rows, np.ones(len(rows))), axis=1) @ ray_basis(lamps.camera_matrix)
+        rays = rays_at(rows, columns, lamps.camera_matrix)
         points = rays * (depth * _plane_distance(lamps))[:, None] + _camera_position(lamps)
     return points.astype(np.float32)
 
@@ -42,7 +42,8 @@ class LampLight:
     """Observations as distant lamps would give them, with the light directions of each pixel."""
 
     observations: NDArray[np.float32]  # (P, F), without the falloff of the lamps
-    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights and an
+    # orthographic camera
     directions: NDArray[np.floating]
     turns: NDArray[np.float32] | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
 
@@ -57,13 +58,19 @@ class LampLight:
             directions = np.einsum("pij,pfj->pfi", turns, directions)
         return cls(observations / strengths, directions, turns)
 
+    @classmethod
+    def distant(cls, observations: NDArray[np.float32], directions: Floats, rays: Floats) -> LampLight:
+        """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3) from the camera."""
+        turns = _turns_to_view(unit(-rays)).astype(np.float32)
+        return cls(observations, np.einsum("pij,fj->pfi", turns, directions.astype(np.float32)), turns)
+
     def in_frame_of_pixels(self, normals: Floats) -> Floats:
         """Return normals (P, 3), given in the capture's frame, in the pixels' own."""
         return normals if self.turns is None else np.einsum("pij,pj->pi", self.turns, normals)
 
-    def in_frame_of_capture(self, normals: Floats) -> Floats:
-        """Return normals (P, 3), given in the pixels' own frames, in the capture's."""
-        return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
+    def in_frame_of_capture(self, vectors: Floats) -> Floats:
+        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' own frames, in the capture's."""
+        return vectors if self.turns is None else np.einsum("pji,p...j->p...i", self.turns, vectors)
 
 
 Rows = NDArray[np.integer]  # numbers of some of a capture's pixels, in the order of its mask

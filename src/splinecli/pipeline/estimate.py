@@ -55,7 +55,7 @@ def distil_for(
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
-    light_of = partial(light_on, capture)
+    light_of = partial(light_on(capture), None)
     teacher = for_capture(estimator, light_of, capture.n_pixels)
     from splinecli.methods.distilled import distil
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from splinecli.calibration.view import find_view
 from splinecli.capture.capture_warnings import estimated_lights
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.lights.named_lights import check_writable, encode_lights
@@ -136,6 +137,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
         ("lights", lights),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
+        *([("camera", camera)] if (camera := _camera_in_words(report)) else []),
         ("intensities", intensities),
         *([("reads", report["reads"])] if report["reads"] else []),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
@@ -151,6 +153,17 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             ("mended", report["mended_lights"] or "not written: no other reading of the lights fits clearly better")
         )
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
+
+
+def _camera_in_words(report: dict[str, Any]) -> str | None:
+    """Return what is known of the camera, for people; None for nothing."""
+    matrix, of_exif = report["camera_matrix"], report["exif_camera_matrix"]
+    if matrix is not None:
+        return f"perspective, focal length {matrix[0][0]:.6g} pixels"
+    if of_exif is None:
+        return None
+    rows = ", ".join(" ".join(f"{number:.6g}" for number in row) for row in of_exif)
+    return f"counts as orthographic; EXIF suggests a --camera-matrix with the rows {rows}"
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
@@ -192,6 +205,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
     first, seconds = summary.images[0], STARTING_SECONDS + _seconds(summary)
+    view = find_view(source.facts[0], None)
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
     if intensities is None and (source.light_intensities != 1).any():
@@ -216,6 +230,8 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
             "intensities": None if found.intensities is None else found.intensities.round(4).tolist(),
         },
         "lamps": None if source.lamps is None else source.lamps.in_words(),
+        "camera_matrix": None if source.camera_matrix is None else source.camera_matrix.tolist(),
+        "exif_camera_matrix": view.matrix.round(1).tolist() if view.known else None,
         "light_intensities": None if intensities is None else str(intensities),
         "mask": None if files.mask is None else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),

@@ -81,8 +81,11 @@ def view_of_report(
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
     matrix = None if camera_matrix is None else window.camera(camera_matrix)
-    if matrix is None and lamps is not None and lamps["camera"] == "perspective":
-        matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)  # of what the window reads
+    seen = report.get("camera_matrix")  # reports of earlier versions lack it
+    if lamps is not None and lamps["camera"] == "perspective":
+        seen = lamps["camera_matrix"]
+    if matrix is None and seen is not None:
+        matrix = np.array(seen, np.float64).reshape(3, 3)  # of what the window reads
     # Without a surface, it only scaled near lamps, whose unit may be any.
     if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])

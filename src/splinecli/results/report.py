@@ -69,6 +69,7 @@ def report_of(
         "light_directions": capture.light_directions.round(6).tolist(),
         "light_errors_deg": None if capture.light_errors_deg is None else capture.light_errors_deg.round(2).tolist(),
         "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
+        "camera_matrix": None if capture.camera_matrix is None else capture.camera_matrix.tolist(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,
         "image_size": [width, height],

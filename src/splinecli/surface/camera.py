@@ -5,10 +5,15 @@ A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns coun
 z to the camera.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.arrays import Bools, Doubles, Floats
+
+Places = NDArray[np.number[Any]]
 
 _LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 
@@ -19,6 +24,11 @@ def pixel_rays(mask: Bools, camera_matrix: Floats) -> Doubles:
     Raises UsageError if the camera matrix is not 3 x 3, or InputError if the numbers are not those of a camera matrix.
     """
     rows, columns = np.nonzero(mask)
+    return rays_at(rows, columns, camera_matrix)
+
+
+def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Doubles:
+    """Return the points (N, 3) of pixel_rays at rows and columns (N,) of the image. Raises the same errors."""
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
     return image @ ray_basis(camera_matrix)
 

@@ -19,6 +19,7 @@ from splinecli.capture.stamp import stamp_content
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.arrays import Bools, Doubles
 from splinecli.maths.normals import unit
+from splinecli.surface.camera import ray_basis
 
 if TYPE_CHECKING:
     from splinecli.capture.source import CaptureSource
@@ -33,7 +34,7 @@ SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel
 
 @dataclass(frozen=True, kw_only=True)
 class LampOptions:
-    """What the user says about near lamps. All lengths have the same unit, such as millimetres.
+    """What the user says about near lamps and the camera. All lengths have the same unit, such as millimetres.
 
     Raises:
         UsageError: a number is not above 0, or two options contradict each other.
@@ -70,7 +71,6 @@ _OPTIONS = {
     "distance": "--light-distance",
     "pixel_size": "--pixel-size",
     "object_width": "--object-width",
-    "camera_matrix": "--camera-matrix",
 }
 
 NO_LAMP_OPTIONS = LampOptions()
@@ -84,7 +84,6 @@ class LampFiles:
     distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
     pixel_size: float | None
     object_width: float | None
-    camera_matrix: Doubles | None  # (3, 3), or None for an orthographic camera
     lobes: Path | None  # the file of the lamps' lobes, or None
     stamp: tuple[Any, ...]  # of the files that were found, from before they were read
     used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
@@ -107,7 +106,7 @@ class LampFiles:
             positions = source.light_directions * self.distance
         if (farthest := np.abs(positions).max(initial=0)) > _FARTHEST:
             raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
-        pixel_size, camera_matrix = self.pixel_size, self.camera_matrix
+        pixel_size, camera_matrix = self.pixel_size, source.camera_matrix
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
             pixel_size = self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
@@ -138,18 +137,29 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             raise UsageError(problem, hint="Add --light-positions FILE or --light-distance D, or leave it out")
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
-    matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
     scaled = options.pixel_size is not None or options.object_width is not None
     pixel_file = None if scaled else _find(folders, PIXEL_SIZE)
     scaled = scaled or pixel_file is not None
     lobes = _find(folders, LOBES)
-    files = (positions, pixel_file, matrix_file, lobes)
+    files = (positions, pixel_file, lobes)
     stamp = tuple(stamp_content(path) for path in files if path is not None)
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
         raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
-    matrix, width = None if matrix_file is None else read_camera_matrix(matrix_file), options.object_width
-    return LampFiles(positions, options.distance, pixel_size, width, matrix, lobes, stamp, used and scaled)
+    return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
+
+
+def find_camera(folder: Path, lamps: LampFiles | None, options: LampOptions) -> tuple[Doubles | None, tuple[Any, ...]]:
+    """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
+
+    Raises InputError where the file is wrong.
+    """
+    folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
+    path = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
+    if path is None:
+        return None, ()
+    stamp = stamp_content(path)
+    return read_camera_matrix(path), (stamp,)
 
 
 def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
@@ -167,11 +177,12 @@ def _path(name: str | None) -> Path | None:
 
 
 def read_camera_matrix(path: Path) -> Doubles:
-    """Return the 3 x 3 numbers of a text file. Raises InputError."""
+    """Return the camera matrix (3, 3) of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
         problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
         raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
+    ray_basis(matrix)  # refuses other numbers
     return matrix
 
 
