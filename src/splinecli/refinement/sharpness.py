@@ -19,7 +19,7 @@ def image_sharpness(mask: NDArray[np.bool_], observations: NDArray[np.floating])
     """Return two numbers (2,), each about -2 to 2, from the observations (P, F) of the true pixels of a mask (H, W).
 
     The first is the median, over the steepest local maxima of the gradient along rows and columns, of the share that
-    the maximum has in the sum with its two neighbours: 1 for a step between two pixels, 0.52 behind a Gaussian with a
+    the maximum has in the sum with its two neighbours: 1 for a step between two pixels, 0.58 behind a Gaussian with a
     sigma of 0.7 pixels. The second is the correlation of gradients of neighbouring pixels between different images,
     which noise does not change. Both are shifted and scaled; zero where the capture has no edges.
     """
