@@ -43,10 +43,11 @@ def image_sharpness(mask: NDArray[np.bool_], observations: NDArray[np.floating])
         above += _between_images(one, other)
         below += (_between_images(one, one) + _between_images(other, other)) / 2
     sizes, shares = np.concatenate(peaks, axis=1)
-    if len(sizes) < _FEWEST_EDGES or below <= 0:
+    if len(sizes) < _FEWEST_EDGES:
         return torch.zeros(2)
+    correlation = above / below if below > 0 else 0.5  # edges in different places
     share = float(np.median(shares[sizes >= np.quantile(sizes, 1 - _STEEP_SHARE)]))
-    return torch.tensor((5 * (share - 0.6), 2 * (above / below - 0.5))).clamp(-2, 2)
+    return torch.tensor((5 * (share - 0.6), 2 * (correlation - 0.5))).clamp(-2, 2)
 
 
 def _between_images(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
