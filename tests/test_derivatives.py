@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import square_grid
-from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
-from splinecli.maths.normals import unit
+from splinecli.maths.normals import curvature_of_normals, gradient_of_normals, unit
 
 SIZE, REACH = 120, 60.0
 X, Y = square_grid(SIZE, REACH * (1 - 1 / SIZE))

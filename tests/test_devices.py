@@ -6,15 +6,16 @@ import pytest
 import torch
 
 from splinecli.errors import UsageError
-from splinecli.system import devices, memory
-from splinecli.system.devices import (
+from splinecli.system import machine as devices
+from splinecli.system import machine as memory
+from splinecli.system.machine import (
+    available_memory,
     cgroup_quotas,
     choose_device,
     choose_precision,
     count_available_cores,
     use_available_cores,
 )
-from splinecli.system.memory import available_memory
 
 
 def test_unknown_device() -> None:

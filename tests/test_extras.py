@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from splinecli.errors import UsageError
-from splinecli.system.extras import import_extra
+from splinecli.system.machine import import_extra
 
 
 @pytest.mark.parametrize(

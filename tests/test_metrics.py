@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splinecli.maths.metrics import angular_error_map_deg, summarise_errors
+from splinecli.maths.normals import angular_error_map_deg, summarise_errors
 
 
 def tilted(degrees: float) -> list[float]:

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from splinecli.system.side_by_side import one_thread_each, side_by_side
+from splinecli.system.machine import one_thread_each, side_by_side
 
 
 @pytest.fixture(params=[1, 3], autouse=True)

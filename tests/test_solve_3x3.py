@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.fits.robust import inverse_3x3, multiply_symmetric
 
 ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Places of xx, yy, zz, xy, xz, yz in a matrix."""

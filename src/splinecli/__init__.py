@@ -101,7 +101,7 @@ def estimate_normals(
     import numpy as np
 
     from splinecli.capture.arrays import capture_from_arrays
-    from splinecli.capture.capture_warnings import PROBABLY_WRONG
+    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
     from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator

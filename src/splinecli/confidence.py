@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.diagnosis.frame_evidence import smooth_normals
+from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.light.indirect_light import PixelPlaces
 from splinecli.light.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
-from splinecli.surface.blocks import Blocks
-from splinecli.system.side_by_side import side_by_side
+from splinecli.surface.pixel_grid import Blocks
+from splinecli.system.machine import side_by_side
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.floating]

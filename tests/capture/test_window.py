@@ -15,7 +15,7 @@ from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import describe_capture
-from splinecli.surface.camera import pixel_rays
+from splinecli.surface.pixel_grid import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]

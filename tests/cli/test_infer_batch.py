@@ -23,9 +23,9 @@ from splinecli.pipeline import estimate, infer
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import Observer
 from splinecli.results import files, report
 from splinecli.system.files import NoRoomError
+from splinecli.system.progress import Observer
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):

@@ -11,8 +11,8 @@ from PIL import Image
 
 from scenes import BUMP_LAMPS, write_bump
 from splinecli.capture.formats import image_size
-from splinecli.capture.formats.image_size import results_bytes
 from splinecli.maths.normals import encode_picture
+from splinecli.pipeline.infer import results_bytes
 
 SHAPE = (40, 50)
 

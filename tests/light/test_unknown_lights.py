@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from scenes import cap_directions, shade, sphere, sphere_cap
 from splinecli import estimate_normals
-from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.capture.restore.light_refinement import fit_near
+from splinecli.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.confidence import add_common_error
 from splinecli.errors import InputError, UsageError
 from splinecli.light import unknown_lights

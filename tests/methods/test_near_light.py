@@ -15,7 +15,7 @@ from splinecli.inference import estimate_normals
 from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator, near_light
 from splinecli.methods.near_light import Blocks, find_surface
-from splinecli.surface.camera import pixel_rays
+from splinecli.surface.pixel_grid import pixel_rays
 
 Floats = NDArray[np.float64]
 SIDE = 40

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from conftest import directions_at, spiral_lights
-from splinecli.fits.two_halves import alternating_signs
+from splinecli.fits.least_squares import alternating_signs
 from splinecli.networks.refine_channels import CHANNELS, channels
 from splinecli.refinement.detail import REACH, restore_detail
 from splinecli.refinement.features import refine_features

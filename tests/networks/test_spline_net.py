@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from splinecli.fits.lambertian import fit_lambertian
+from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import error_negative_log_likelihood, probability_within

@@ -26,7 +26,7 @@ from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Member, list_captures
-from splinecli.pipeline.observer import SILENT
+from splinecli.system.progress import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from glb_file import read_glb
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.surface import decimation
-from splinecli.surface.decimation import decimated_mesh
-from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.surface import mesh as decimation
+from splinecli.surface.mesh import SurfaceMesh, decimated_mesh, surface_mesh
 from splinecli.surface.surface_files import Surface, encode_surface
 
 SIDE = 90

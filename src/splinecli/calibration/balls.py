@@ -16,7 +16,7 @@ from splinecli.capture.formats.images import decode_image, read_image, read_mask
 from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
 from splinecli.capture.source import Progress
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles, Singles
+from splinecli.maths import Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 
 REFERENCES = ("ref", "reference")

@@ -15,7 +15,7 @@ from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Doubles
+from splinecli.maths import Bools, Doubles
 
 Target = Literal["ball", "card"]
 

@@ -13,8 +13,8 @@ import numpy as np
 from splinecli.calibration.balls import BallCalibration
 from splinecli.calibration.mirror_ball import ball_centre, reflect
 from splinecli.calibration.view import View
-from splinecli.maths.arrays import Doubles
-from splinecli.surface.camera import focal_length, ray_basis
+from splinecli.maths import Doubles
+from splinecli.surface.pixel_grid import focal_length, ray_basis
 
 LARGEST_UNCERTAINTY = 0.4
 """Largest uncertainty of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel, and the

@@ -13,8 +13,8 @@ import numpy as np
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.view import unit_rays
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Doubles
-from splinecli.surface.camera import ray_basis
+from splinecli.maths import Array, Doubles
+from splinecli.surface.pixel_grid import ray_basis
 
 HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
 MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball

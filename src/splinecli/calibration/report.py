@@ -6,7 +6,7 @@ import numpy as np
 
 from splinecli.calibration.balls import CalibratedLights
 from splinecli.calibration.lamp_positions import LampPositions
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 from splinecli.maths.normals import angle_between_deg
 
 UNSURE_VISIBLE = 0.6  # smallest visible share of an outline without a warning

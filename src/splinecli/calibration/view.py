@@ -10,9 +10,9 @@ import numpy as np
 
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.lights.lamp_files import read_camera_matrix
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import ray_basis
+from splinecli.surface.pixel_grid import ray_basis
 
 DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
 

@@ -1,7 +1,6 @@
 """Captures: images of one object under known lights, read from folders of files."""
 
 from splinecli.capture.arrays import capture_from_arrays
-from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.images import read_image, read_mask
 from splinecli.capture.formats.normal_files import read_normal_map
 from splinecli.capture.layouts.capture_files import Overrides
@@ -11,6 +10,7 @@ from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.capture.reader import open_capture, read_capture
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource
+from splinecli.capture_warnings import CaptureWarning
 
 __all__ = [
     "Capture",

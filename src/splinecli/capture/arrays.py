@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splinecli.capture.capture_warnings import ESTIMATED_COLOURS
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
@@ -15,8 +14,9 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import StoredPixels, collect_observations, linear_light
 from splinecli.capture.record import Capture
 from splinecli.capture.stored import StoredCapture
+from splinecli.capture_warnings import ESTIMATED_COLOURS
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Array, Doubles
+from splinecli.maths import Array, Doubles
 
 
 def capture_from_arrays(

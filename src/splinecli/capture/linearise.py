@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.lamp_colours import SAMPLE, lamp_colours
-from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
+from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at, white_level_warnings
 from splinecli.capture.window import Window
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
+from splinecli.maths import Array, Bools, Doubles, Integers, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
 BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
@@ -194,7 +194,7 @@ def collect_observations(
             colours.append(replace(image, linear=image.linear[compared]).colours())
         del image  # before the next one is decoded
     saturation = Saturation(n_pixels, tuple(found), white_level)
-    warnings = codes.white_level(saturation.white_level)
+    warnings = white_level_warnings(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)
     if saturated > codes.SATURATED_SHARE:
         text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."

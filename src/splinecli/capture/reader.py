@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.formats.exif import UPRIGHT, check_exposures, common_orientation
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
@@ -22,14 +21,15 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import LightForm, RowForm
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.capture.linearise import AUTOMATIC, RadiometricCalibration
-from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture.stamp import stamp_files
 from splinecli.capture.window import WHOLE, Window
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
+from splinecli.system.files import StrPath
 
 EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
+from splinecli.maths import Array, Bools, Doubles, Integers, Singles
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 

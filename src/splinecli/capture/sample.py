@@ -7,7 +7,7 @@ import numpy as np
 
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Floats
+from splinecli.maths import Bools, Floats
 
 MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels

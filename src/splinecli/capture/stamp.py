@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.capture.formats.text import read_text
-from splinecli.capture.paths import check_file, is_substitution, reading
-from splinecli.system.files import file_sha256
+from splinecli.system.files import check_file, file_sha256, is_substitution, reading
 
 if TYPE_CHECKING:
     from splinecli.capture.layouts.capture_files import CaptureFiles

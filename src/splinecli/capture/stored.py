@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.capture.restore.white_level import Saturation
+from splinecli.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles, Integers
+from splinecli.maths import Doubles, Integers
 
 
 def name_reading(*, as_stored: bool) -> str:

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.formats.image_size import check_stored_size
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import AS_STORED, StoredPixels
 from splinecli.capture.restore.saturation import find_saturated
-from splinecli.capture.restore.white_level import Saturation, WhiteLevel
+from splinecli.capture.restore.white_level import Saturation, WhiteLevel, white_level_warnings
 from splinecli.capture.sample import Sample, closeup_of, grid_of, pixels_of, sample_observations
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture.window import WHOLE
-from splinecli.maths.arrays import Doubles
+from splinecli.capture_warnings import SATURATED_SHARE, CaptureWarning
+from splinecli.maths import Doubles
 
 DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
 _FULL_SCALE = 65_535  # of 16-bit files
@@ -61,7 +61,7 @@ class CaptureSummary:
         saturated = [image for image in self.images if image.saturated > SATURATED_SHARE]
         dark = [image for image in self.images if image.dtype.startswith("uint") and image.bright < DARK]
         n_sizes = len({image.shape[:2] for image in self.images})
-        found = [*self.source.warnings, *self.lamp_warnings, *codes.white_level(self.white_level)]
+        found = [*self.source.warnings, *self.lamp_warnings, *white_level_warnings(self.white_level)]
         if n_sizes > 1:
             text = f"The images have {n_sizes} different sizes; all images need the same size."
             found.append(CaptureWarning(codes.DIFFERENT_SIZES, text))

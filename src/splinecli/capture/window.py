@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.maths import Bools, Doubles, Floats
 
 Numbers = TypeVar("Numbers", bound=np.generic)
 

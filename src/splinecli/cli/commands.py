@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from splinecli.cli.failures import ParserError, error_document, printed_documents
-from splinecli.system.memory import check_address_space, keep_freed_memory
+from splinecli.system.machine import check_address_space, keep_freed_memory
 
 TERM_WIDTH = 30  # columns of the names of options in the help; a longer name has a line of its own
 HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Typer breaks it at 80

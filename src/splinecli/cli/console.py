@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from splinecli.errors import printable
-from splinecli.pipeline.observer import Advance, Observer
+from splinecli.system.progress import Advance, Observer
 
 LINE_SECONDS = 30.0  # seconds between two lines of progress where stderr is not a terminal
 

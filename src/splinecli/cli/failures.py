@@ -17,7 +17,7 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.cli.shared import listed
 from splinecli.errors import SplinecliError, UsageError
 from splinecli.system.files import as_splinecli_error
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.machine import is_out_of_memory
 
 DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from typer import Argument, Option
 
-from splinecli.capture.capture_warnings import PROBABLY_WRONG
+from splinecli.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
 from splinecli.errors import InputError

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splinecli.capture.robust_fit import fit_robustly, shadow_weights
-from splinecli.diagnosis.frame_evidence import RoughNormals
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.diagnosis.frame_evidence import _FITS, RoughNormals
+from splinecli.fits.robust import fit_robustly, shadow_weights
+from splinecli.maths import Bools, Doubles, Floats
 
 AGREEMENT_WEIGHT = 5.0
 """Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9 with right
@@ -30,7 +30,6 @@ _FEWEST_SHARE, _FEWEST = 0.001, 20  # of lit observations in shadow, below which
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
 _LIT_SHARE, _DARK_SHARE = 0.25, 0.4  # of a pixel's brightest shading, and of its own, beyond which shadows are judged
 _MARGIN = 0.5  # pixels that a surface must rise above a ray
-_FITS = 5
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splinecli.capture.robust_fit import fit_robustly, shadow_weights
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.fits.robust import fit_robustly, shadow_weights
+from splinecli.maths import Bools, Doubles, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
 STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
-_FITS = 5
+_FITS = 5  # weighted fits to a pixel
 _TURNED_PIXELS = 2000
 
 

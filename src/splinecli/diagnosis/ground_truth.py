@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.sample import Sample
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.diagnosis.frame_evidence import rough_normals
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.maths import Bools, Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
 
 MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture.sample import Sample
-from splinecli.maths.arrays import Bools, Singles
+from splinecli.maths import Bools, Singles
 
 LARGEST = 8  # largest shift that is looked for, in pixels of the sample
 

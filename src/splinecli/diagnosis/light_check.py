@@ -22,7 +22,7 @@ from splinecli.diagnosis.light_order import (
     check_order,
 )
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
-from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
+from splinecli.maths import Bools, Doubles, Floats, Integers
 
 CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""

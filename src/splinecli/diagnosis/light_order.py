@@ -23,9 +23,9 @@ from splinecli.capture.lights.light_fit import (
     swapped_orders,
 )
 from splinecli.capture.lights.light_rows import lights_of_half_vectors, zenith_as_elevation
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, lit_values, shadow_weights
 from splinecli.diagnosis.light_rings import mend_rings
-from splinecli.maths.arrays import Bools, Doubles, Floats, Integers
+from splinecli.fits.robust import absolute_weights, fit_robustly, lit_values, shadow_weights
+from splinecli.maths import Bools, Doubles, Floats, Integers
 
 MIN_LIGHTS = 6  # fewer lights leave too few equations to judge their order
 

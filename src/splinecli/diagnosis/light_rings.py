@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture.lights.light_fit import Factors
-from splinecli.maths.arrays import Doubles, Integers
+from splinecli.maths import Doubles, Integers
 from splinecli.maths.normals import unit
 
 FEWEST_IN_RING = 4

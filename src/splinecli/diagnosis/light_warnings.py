@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, LightFrame
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.diagnosis.light_check import OPEN_ERROR_DEG, Candidate, LightCheck, mirror_twin
 from splinecli.diagnosis.light_order import FEWER_LEFT, HALF_VECTORS, UNKNOWN_ORDER, ZENITH
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splinecli.capture.lights.light_fit import Factors
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
 MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness

@@ -8,8 +8,16 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import printable
-from splinecli.evaluation import statistics
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, all_captures, all_skipped, heading, lights_in_words
+from splinecli.evaluation.statistics import (
+    AVERAGE,
+    SIGNIFICANCE,
+    Comparison,
+    compare,
+    in_words,
+    p_in_words,
+    trial_averages,
+)
 from splinecli.evaluation.tables import best_cells, table_rows
 from splinecli.results.templates import picture_url, render
 
@@ -49,7 +57,7 @@ def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, 
         several_methods=len(first.methods) > 1,
         sections=[_section(evaluation) for evaluation in evaluations],
         figures=[_figure(caption, png) for caption, png in figures],
-        significance=statistics.SIGNIFICANCE,
+        significance=SIGNIFICANCE,
     )
 
 
@@ -87,13 +95,13 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
 
 
 def _section(evaluation: Evaluation) -> dict[str, Any]:
-    comparisons = statistics.compare(evaluation)
-    average = [c for c in comparisons if c.capture == statistics.AVERAGE]
+    comparisons = compare(evaluation)
+    average = [c for c in comparisons if c.capture == AVERAGE]
     return {
         "heading": heading(evaluation.protocol),
         "errors": _error_table(evaluation),
         "seconds": _seconds_table(evaluation),
-        "sentences": [statistics.in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
+        "sentences": [in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
         "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
         "pairs": [_pair_row(c) for c in comparisons],
     }
@@ -115,7 +123,7 @@ def _error_table(evaluation: Evaluation) -> Table:
     body = []
     for r, (method, *values) in enumerate(rows, start=1):
         trials = [maes_deg[method, capture] for capture in evaluation.captures]
-        trials.append(statistics.trial_averages(evaluation, method))
+        trials.append(trial_averages(evaluation, method))
         cells = [
             Cell(value, f"± {np.std(maes):.2f}" if len(maes) > 1 else "", "best" if (r, c) in best else "")
             for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
@@ -134,7 +142,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
     return [[Cell("method"), *(Cell(printable(capture)) for capture in evaluation.captures)], *body]
 
 
-def _matrix(methods: Sequence[str], comparisons: Sequence[statistics.Comparison]) -> Table:
+def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
     """Return a table of the MAE of the row's method minus that of the column's; a mark where they differ."""
     cells = {}
     for c in comparisons:
@@ -148,12 +156,12 @@ def _matrix(methods: Sequence[str], comparisons: Sequence[statistics.Comparison]
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
 
-def _pair_row(c: statistics.Comparison) -> dict[str, str]:
+def _pair_row(c: Comparison) -> dict[str, str]:
     if c.interval_deg is None or c.p_holm is None:
         interval = p_value = "not tested"
     else:
         interval = " to ".join(map(_signed, c.interval_deg))
-        p_value = statistics.p_in_words(c.p_holm)
+        p_value = p_in_words(c.p_holm)
     verdict = {None: "", True: f"{c.first if c.difference_deg < 0 else c.second} is better", False: "no"}
     return {
         "capture": c.capture,

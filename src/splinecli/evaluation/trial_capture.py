@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
-from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.capture.lights.draws import NOISE_STREAM, PIXELS_STREAM
 from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.sample import sample_observations
 from splinecli.capture.stored import StoredCapture
+from splinecli.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol

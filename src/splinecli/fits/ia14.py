@@ -9,7 +9,7 @@ from math import comb
 import torch
 from torch import Tensor
 
-from splinecli.fits.shadows import lit_observations
+from splinecli.fits.least_squares import lit_observations
 
 DEGREE_OBSERVATION = 2  # N1 in the paper
 DEGREE_LIGHT = 4  # N2 in the paper
@@ -18,7 +18,7 @@ _MOST_EXCHANGES = 100
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
-def solve(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
+def solve_ia14(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3); see fit."""
     return fit(observations, light_directions, valid)[0]
 

@@ -8,13 +8,13 @@ Yuille, "The bas-relief ambiguity", IJCV 1999). The albedo then changes with the
 
 import numpy as np
 
-from splinecli.capture.robust_fit import fit_robustly, lit_values, shadow_weights
 from splinecli.diagnosis.cast_shadows import cast_shadows
 from splinecli.diagnosis.frame_evidence import smooth_normals
-from splinecli.maths.arrays import Bools, Doubles, Singles
+from splinecli.fits.robust import fit_robustly, lit_values, shadow_weights
+from splinecli.maths import Bools, Doubles, Singles
 from splinecli.maths.normals import unit
-from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
+from splinecli.surface.pixel_grid import Blocks
 
 # Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions (3 % without the outline).
 _SHADOW_LOG_ODDS, _OUTLINE_LOG_ODDS = 11.0, 8.0

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.maths.normals import unit
-from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
-from splinecli.system.side_by_side import side_by_side
+from splinecli.surface.pixel_grid import Blocks
+from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import focal_length, ray_basis
+from splinecli.surface.pixel_grid import focal_length, ray_basis
 
 Floats = NDArray[np.floating]
 

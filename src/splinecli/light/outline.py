@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import fit_robustly
 from splinecli.diagnosis.frame_evidence import outward_directions
+from splinecli.fits.robust import fit_robustly
 from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from splinecli.light.ambiguities import bump_log_odds, lower_lights
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
 from splinecli.networks.weights import light_net
-from splinecli.system.side_by_side import side_by_side
+from splinecli.system.machine import side_by_side
 
 LARGEST_ERROR_DEG = 20.0
 """Lights with a larger expected error on average are refused: their normals would be worth little."""

@@ -12,8 +12,8 @@ from splinecli.errors import UsageError
 from splinecli.maths.observation_map import map_scale
 from splinecli.methods.estimator import Directions, Observations, directions_at
 from splinecli.methods.least_squares import TOWARDS_CAMERA
+from splinecli.system.machine import side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
 
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).

@@ -30,8 +30,8 @@ from splinecli.methods.pixel_sample import PixelSample, draw_sample
 from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize
 from splinecli.networks.error_head import median_error_deg
 from splinecli.networks.perceptron import Perceptron
+from splinecli.system.machine import side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.fits.robust import solve_each
 from splinecli.maths.normals import unit
-from splinecli.maths.solve_3x3 import solve_each
 from splinecli.methods.estimator import Directions, Observations
 from splinecli.system.progress import Progress
 

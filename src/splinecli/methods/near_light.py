@@ -11,8 +11,9 @@ import numpy as np
 
 from splinecli.capture import Capture
 from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
-from splinecli.surface.blocks import Blocks
+from splinecli.methods import make_estimator
 from splinecli.surface.integration import integrate_normals
+from splinecli.surface.pixel_grid import Blocks
 
 ROUNDS = 2
 """Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
@@ -28,8 +29,6 @@ def find_surface(capture: Capture) -> Capture:
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
-    from splinecli.methods import make_estimator
-
     estimator = make_estimator(METHOD)
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)

@@ -19,8 +19,8 @@ from splinecli.networks.capture_context import CaptureContext, sample_of
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement.refiner import NetworkRefiner
+from splinecli.system.machine import one_thread_each
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import one_thread_each
 
 Precision = Literal["float32", "bfloat16"]
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from splinecli.capture.robust_fit import lit_values
+from splinecli.fits.robust import lit_values
 from splinecli.networks.layers import zeroed
 
 SAMPLE = 256  # pixels of a capture that its other pixels see

@@ -21,11 +21,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from splinecli.capture.paths import check_file
 from splinecli.errors import InputError, ModelError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import check_length, load_strictly
+from splinecli.system.files import check_file
 
 # Our module names and theirs of NE-Net. LI-Net differs in the name of its sequences.
 _NE_NET_MODULES = {

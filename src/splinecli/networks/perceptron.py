@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.fits.least_squares import weighted_least_squares
 from splinecli.maths.observation_map import map_scale
-from splinecli.system.side_by_side import one_thread_each
+from splinecli.system.machine import one_thread_each
 
 BATCH = 256
 _LEARNING_RATE = 3e-3

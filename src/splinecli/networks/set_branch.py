@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from splinecli.fits.weighted_least_squares import weighted_sum
-from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.fits.least_squares import weighted_sum
+from splinecli.fits.robust import inverse_3x3, multiply_symmetric
 from splinecli.networks.capture_context import CaptureContext, ContextLayer, Summary, brightness_level
 from splinecli.networks.layers import zeroed
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from splinecli.fits.lambertian import fit_lambertian
+from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
 from splinecli.networks.capture_context import CaptureContext
 from splinecli.networks.config import NetworkConfig

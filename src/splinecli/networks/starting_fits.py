@@ -6,8 +6,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from splinecli.fits import ia14, iw12
-from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.fits.ia14 import solve_ia14
+from splinecli.fits.least_squares import solve_iw12, weighted_least_squares
 
 
 def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
@@ -16,9 +16,9 @@ def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor
 
 STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
     "ls": _least_squares,
-    "iw12": iw12.solve,
-    "iw12-all": partial(iw12.solve, shadow_share=0),
-    "ia14": ia14.solve,
+    "iw12": solve_iw12,
+    "iw12-all": partial(solve_iw12, shadow_share=0),
+    "ia14": solve_ia14,
 }
 """Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better on metals."""
 

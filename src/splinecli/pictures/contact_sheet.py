@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths.arrays import Bools, Floats
+from splinecli.maths import Bools, Floats
 from splinecli.maths.normals import encode_picture
 from splinecli.pictures.png import Picture
 from splinecli.pixel_sets.store import Entry, PixelSet

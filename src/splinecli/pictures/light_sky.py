@@ -3,7 +3,7 @@
 import numpy as np
 
 from splinecli.errors import printable
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 from splinecli.maths.normals import unit
 from splinecli.pictures.plotting import png_bytes
 

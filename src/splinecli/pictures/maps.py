@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from splinecli.maths.arrays import Bools, Floats, Singles
+from splinecli.maths import Bools, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.pictures.png import Picture

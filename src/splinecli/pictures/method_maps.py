@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splinecli.maths.arrays import Bools, Floats
+from splinecli.maths import Bools, Floats
 from splinecli.maths.normals import encode_picture
 from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes

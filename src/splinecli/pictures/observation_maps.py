@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splinecli.maths.arrays import Floats, Integers
+from splinecli.maths import Floats, Integers
 from splinecli.pictures.plotting import png_bytes
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distr
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Member, Outcome, Redo, Shard, failed, list_captures, run_member
-from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import check_writable, write_text
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
 
 

@@ -18,8 +18,8 @@ from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.pictures.calibration import calibration_picture
 from splinecli.pictures.png import encode_png
-from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.files import check_free
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"

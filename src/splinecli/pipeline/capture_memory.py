@@ -6,12 +6,11 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.formats.facts import StoredSize
-from splinecli.capture.formats.image_size import capture_bytes
+from splinecli.capture.source import capture_bytes
 from splinecli.errors import SplinecliError
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Member
-from splinecli.system.devices import choose_device, count_available_cores
-from splinecli.system.memory import available_memory
+from splinecli.system.machine import available_memory, choose_device, count_available_cores
 
 BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
 REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import SplinecliError, UsageError
-from splinecli.system.devices import count_available_cores
-from splinecli.system.extras import import_extra
 from splinecli.system.files import read_json
+from splinecli.system.machine import count_available_cores, import_extra
 
 if TYPE_CHECKING:
     from distributed import Client

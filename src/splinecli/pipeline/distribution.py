@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Any
 from splinecli import __version__
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.connection import ClusterOptions, connected
-from splinecli.pipeline.observer import Observer
-from splinecli.system.extras import import_extra
 from splinecli.system.files import UNFINISHED, made_folder, refusals_as_output_errors
-from splinecli.system.memory import available_memory, keep_freed_memory
+from splinecli.system.machine import available_memory, import_extra, keep_freed_memory
+from splinecli.system.progress import Observer
 from splinecli.system.publishing import locked_file
 
 if TYPE_CHECKING:

@@ -12,13 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from splinecli.capture import Capture
-from splinecli.capture.capture_warnings import (
-    NOT_DISTILLED,
-    PROBABLY_WRONG,
-    ROUGH_LIGHTS,
-    UNTRAINED_LIGHTS,
-    CaptureWarning,
-)
+from splinecli.capture_warnings import NOT_DISTILLED, PROBABLY_WRONG, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
 from splinecli.errors import UsageError
 from splinecli.inference import NormalEstimate, estimate_normals, light_on
@@ -26,8 +20,7 @@ from splinecli.methods import Estimator
 from splinecli.methods.estimator import for_capture, tells_confidence
 from splinecli.methods.near_light import find_surface
 from splinecli.methods.student_size import FEWEST_PIXELS, student_sizes
-from splinecli.pipeline.observer import SILENT, Advance, Observer
-from splinecli.results.report import Clock
+from splinecli.system.progress import SILENT, Advance, Clock, Observer
 
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator

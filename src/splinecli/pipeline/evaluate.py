@@ -28,9 +28,9 @@ from splinecli.networks.weights import untrained_warning
 from splinecli.pipeline.capture_memory import source_bytes
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Item, LostError, distributor
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.system.devices import count_available_cores
 from splinecli.system.files import check_writable
+from splinecli.system.machine import count_available_cores
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
 
 DEFAULT_TRIALS = 100

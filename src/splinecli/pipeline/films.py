@@ -10,8 +10,8 @@ from splinecli.capture.stamp import digest, stamp_content
 from splinecli.errors import OutputError, UsageError
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.infer_options import Reading
-from splinecli.pipeline.observer import Observer
 from splinecli.system.files import read_json
+from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
 FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.formats.image_size import check_memory, results_bytes
+from splinecli.capture.formats.image_size import check_memory
 from splinecli.capture.layouts.result_names import FOUND_MASK, LIGHT_FILES, PAGE
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.capture.source import BYTES_OF_RESULTS
 from splinecli.capture.stamp import digest
 from splinecli.diagnosis.checks import check_capture
 from splinecli.errors import OutputError, UsageError
@@ -25,17 +26,20 @@ from splinecli.pictures.maps import albedo_picture
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.estimate import estimate_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.surface import make_surface, view_of_report
+from splinecli.pipeline.surface import BYTES_OF_SURFACE, make_surface, view_of_report
 from splinecli.results import files
 from splinecli.results.albedo import albedo_map
 from splinecli.results.page import result_page
-from splinecli.results.report import Clock, report_of
+from splinecli.results.report import report_of
 from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
+from splinecli.system.progress import SILENT, Clock, Observer
 from splinecli.system.publishing import Content, held_folder, refuse_link
+
+_BYTES_OF_ALBEDO = 52
+"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
 
 
 def infer_capture(
@@ -224,3 +228,10 @@ def _make_files(
         )
         found.append([(PAGE, page)])
     return found
+
+
+def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface: bool = False) -> int:
+    """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
+    # The surface is made after what the albedo needs is free again.
+    more = max(_BYTES_OF_ALBEDO + n_lights if albedo else 0, BYTES_OF_SURFACE if surface else 0)
+    return n_pixels * (BYTES_OF_RESULTS + more)

@@ -17,7 +17,6 @@ from splinecli.capture.lights.found_lights import ESTIMATE, LightFinder, azimuth
 from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.lights.light_rows import LightForm
-from splinecli.capture.paths import check_file
 from splinecli.capture.reader import EQUAL
 from splinecli.capture.record import check_light_indices
 from splinecli.capture.restore.white_level import check_white_level
@@ -29,8 +28,9 @@ from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
 from splinecli.pipeline.surface import check_pixel_size
 from splinecli.surface.bilateral_equations import STIFFNESS
-from splinecli.system.devices import Device, Precision
-from splinecli.system.exr import check_exr
+from splinecli.surface.surface_files import check_exr
+from splinecli.system.files import check_file
+from splinecli.system.machine import Device, Precision
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import estimated_lights
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.lights.named_lights import check_writable, encode_lights
 from splinecli.capture.summary import CaptureSummary, summarise_capture
+from splinecli.capture_warnings import estimated_lights
 from splinecli.diagnosis.checks import check_evidence
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
@@ -21,8 +21,8 @@ from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
 from splinecli.pipeline.estimate import AUTOMATIC_FROM
 from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.infer_options import Reading
-from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.files import check_free, write_bytes
+from splinecli.system.progress import SILENT, Observer
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net

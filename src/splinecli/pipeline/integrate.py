@@ -10,21 +10,27 @@ from typing import Any, get_args
 import numpy as np
 
 from splinecli.capture import read_image, read_normal_map
-from splinecli.capture.formats.image_size import BYTES_OF_SURFACE, ExpectedSize, check_memory
+from splinecli.capture.formats.image_size import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.layouts.result_names import ALBEDO_PICTURE, NORMALS, REPORT
 from splinecli.capture.lights.lamp_files import read_camera_matrix
 from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.surface import check_pixel_size, make_surface, view_of_report
+from splinecli.pipeline.surface import BYTES_OF_SURFACE, check_pixel_size, make_surface, view_of_report
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.surface.bilateral_equations import STIFFNESS
-from splinecli.surface.camera import ray_basis
-from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, encode_surface, file_names
-from splinecli.system.exr import check_exr
-from splinecli.system.extras import import_extra
+from splinecli.surface.pixel_grid import ray_basis
+from splinecli.surface.surface_files import (
+    DEFAULT_FORMATS,
+    SURFACE_FILES,
+    SURFACE_REPORT,
+    check_exr,
+    encode_surface,
+    file_names,
+)
 from splinecli.system.files import check_free, read_json
+from splinecli.system.machine import import_extra
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
 
 SCHEMA = 2  # rises when a field of the report changes its meaning

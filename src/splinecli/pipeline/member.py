@@ -18,17 +18,16 @@ from splinecli import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
-from splinecli.capture.paths import find_mode, resolve
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, method_names
 from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import Observer
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.index import Entry
-from splinecli.system.files import NoRoomError, as_splinecli_error
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.files import NoRoomError, as_splinecli_error, find_mode, resolve
+from splinecli.system.machine import is_out_of_memory
+from splinecli.system.progress import Observer
 from splinecli.system.publishing import is_plain
 
 _SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")

@@ -12,7 +12,6 @@ from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Item, LostError, distributor
-from splinecli.pipeline.observer import SILENT, Advance, Observer
 from splinecli.pixel_sets.entries import (
     CaptureChangedError,
     ScenePlan,
@@ -24,6 +23,7 @@ from splinecli.pixel_sets.entries import (
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
+from splinecli.system.progress import SILENT, Advance, Observer
 from splinecli.system.publishing import held_folder
 
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from splinecli.capture.window import parse_window
 from splinecli.errors import UsageError
 from splinecli.surface.bilateral_equations import STIFFNESS
-from splinecli.surface.camera import focal_length
-from splinecli.surface.decimation import decimated_mesh
 from splinecli.surface.integration import integrate_normals
-from splinecli.surface.mesh import surface_mesh
+from splinecli.surface.mesh import decimated_mesh, surface_mesh
+from splinecli.surface.pixel_grid import focal_length
 from splinecli.surface.surface_files import Surface
 
+BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
 

@@ -20,8 +20,8 @@ from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.relief import read_relief
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.synthesis.shapes import draw_view
-from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, free_name, replacing
+from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource

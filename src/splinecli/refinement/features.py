@@ -9,9 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
-from splinecli.fits.two_halves import TwoHalves, compare_halves
-from splinecli.fits.weighted_least_squares import weighted_sum
+from splinecli.fits.least_squares import (
+    LAMBERTIAN_SHADOW_SHARE,
+    TwoHalves,
+    compare_halves,
+    fit_lambertian,
+    weighted_sum,
+)
 from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_channels import MEDIAN_OFFSET, TENSOR, VECTORS, WIDTHS
 
@@ -31,7 +35,7 @@ def refine_features(
         normals: (P, 3), unit.
         error: (P, 2), see networks/error_head.py.
         reference: the brightness of the capture, see `brightness`.
-        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
+        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/least_squares.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -60,7 +64,7 @@ def refine_features(
         "mean": level,
         "deviation": ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
         "residual": 3 * (unexplained.square() @ mean).sqrt(),
-        "dark_share": (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
+        "dark_share": (observed < LAMBERTIAN_SHADOW_SHARE).to(observed.dtype) @ mean,
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (_HALVES_SCALE * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),

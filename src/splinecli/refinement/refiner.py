@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.fits.two_halves import alternating_signs
+from splinecli.fits.least_squares import alternating_signs
 from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
 from splinecli.networks.refine_channels import CHANNELS, channels
@@ -25,9 +25,8 @@ from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.halving import HalfCapture
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
-from splinecli.system.memory import return_freed_memory
+from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
 
 MARGIN = 112
 """Pixels around a tile that are seen, a multiple of COARSEST.

@@ -38,8 +38,7 @@ from splinecli.capture.layouts.result_names import (
     REPORT,
 )
 from splinecli.capture.lights.light_files import rows_text
-from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
-from splinecli.maths.normals import Convention, describe, encode_picture
+from splinecli.maths.normals import Convention, curvature_of_normals, describe, encode_picture, gradient_of_normals
 from splinecli.pictures.maps import (
     albedo_picture,
     confidence_picture,
@@ -48,14 +47,13 @@ from splinecli.pictures.maps import (
     signed_picture,
 )
 from splinecli.pictures.png import encode_png
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_tiff, file_names
-from splinecli.system.exr import encode_exr
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, encode_tiff, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
 if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
-    from splinecli.results.report import Clock
+    from splinecli.system.progress import Clock
 
 Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
 

@@ -17,7 +17,7 @@ from splinecli.capture.layouts.result_names import NORMALS, PAGE, REPORT
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import read_report
 from splinecli.results.templates import picture_url, render
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.machine import is_out_of_memory
 
 INDEX = "index.html"
 

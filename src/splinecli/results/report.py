@@ -1,7 +1,6 @@
 """The report that `infer` writes for a capture, report.json, and the clock of its stages."""
 
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -11,31 +10,6 @@ from splinecli import __version__
 from splinecli.capture.stored import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
-
-STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
-"""The stages, in their order, but for page.html: it is one of the pictures, and comes after the surface."""
-
-
-class Clock:
-    """Adds up the seconds of stages, each of which ends where the next one begins. The first is reading."""
-
-    def __init__(self) -> None:
-        self._seconds = dict.fromkeys(STAGES, 0.0)
-        self._stage, self._since = STAGES[0], time.perf_counter()
-
-    def begin(self, stage: str) -> None:
-        """End the current stage and begin one of STAGES."""
-        now = time.perf_counter()
-        self._seconds[self._stage] += now - self._since
-        self._stage, self._since = stage, now
-
-    def seconds(self) -> dict[str, float]:
-        """Return the seconds of each stage so far, and of all together as `total`."""
-        self.begin(self._stage)
-        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
-            "total": round(sum(self._seconds.values()), 3)
-        }
-
 
 SCHEMA = 2  # rises when a field of the report changes its meaning
 

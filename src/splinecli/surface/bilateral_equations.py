@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.maths import Bools, Doubles, Floats
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
+from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
 STIFFNESS = 2.0  # how easily the surface tears, as in the paper

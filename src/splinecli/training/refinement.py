@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from splinecli.fits.two_halves import alternating_signs
+from splinecli.fits.least_squares import alternating_signs
 from splinecli.inference import estimate_pixels
 from splinecli.light.indirect_light import IndirectLight
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows

@@ -16,9 +16,8 @@ from PIL import Image, ImageCms
 
 from scenes import with_chunk
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.formats.colour_profile import profile_curve
 from splinecli.capture.formats.facts import StatedCurve, read_facts
-from splinecli.maths.transfer import TransferCurve, decode_transfer
+from splinecli.maths.transfer import TransferCurve, decode_transfer, profile_curve
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 STORED = np.linspace(0, 1, 1001).astype(np.float32)

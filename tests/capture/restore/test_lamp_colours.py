@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scenes import shade, sphere, spiral_lights, write_capture
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.reader import open_capture
-from splinecli.capture.robust_fit import fit_scaled_normals
+from splinecli.fits.robust import fit_scaled_normals
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.results.albedo import albedo_map
 

@@ -10,7 +10,7 @@ from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.reader import open_capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
-from splinecli.capture.robust_fit import fit_scaled_normals
+from splinecli.fits.robust import fit_scaled_normals
 from splinecli.maths.normals import angle_between_deg, unit
 
 INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from splinecli.errors import InputError, SplinecliError
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.machine import is_out_of_memory
 
 DAMAGED, COPY_AGAIN = "the image is damaged and cannot be read", "Copy or export it again"
 """Problem and hint for a damaged image."""

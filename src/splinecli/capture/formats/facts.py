@@ -15,13 +15,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_curve
 from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
 from splinecli.capture.formats.raw import RAW_SUFFIXES, raw_size
 from splinecli.capture.formats.tiff import first_page
-from splinecli.capture.paths import check_file, reading
 from splinecli.errors import InputError
-from splinecli.maths.transfer import BT709, SRGB, TransferCurve
+from splinecli.maths.transfer import BT709, LARGEST_PROFILE, SRGB, TransferCurve, profile_curve
+from splinecli.system.files import check_file, reading
 
 if TYPE_CHECKING:
     from PIL import Image

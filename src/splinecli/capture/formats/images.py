@@ -17,9 +17,9 @@ from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_im
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
 from splinecli.capture.formats.raw import decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
-from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Singles
+from splinecli.maths import Array, Bools, Singles
+from splinecli.system.files import StrPath
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")

@@ -16,7 +16,7 @@ import numpy as np
 from splinecli.capture.formats.damage import damage_as_input_error
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array
+from splinecli.maths import Array
 
 KEY = "Normal_gt"
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import native_stderr
 from splinecli.errors import InputError
-from splinecli.system.extras import import_extra
 from splinecli.system.files import utf8_name
+from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
     import rawpy

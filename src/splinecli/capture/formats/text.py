@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture.formats.facts import JPEG, PNG, TIFF
-from splinecli.capture.paths import check_file, is_substitution, reading
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
+from splinecli.system.files import check_file, is_substitution, reading
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")

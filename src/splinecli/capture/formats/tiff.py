@@ -12,8 +12,8 @@ import numpy as np
 
 from splinecli.capture.formats.damage import COPY_AGAIN, damage_as_input_error
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array
-from splinecli.system.memory import is_out_of_memory
+from splinecli.maths import Array
+from splinecli.system.machine import is_out_of_memory
 
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 _LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture

@@ -11,8 +11,8 @@ from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
 from splinecli.capture.layouts.result_names import LIGHT_FILES as FOUND_LIGHTS
 from splinecli.capture.layouts.result_names import OWN_FILES, PLOTS
-from splinecli.capture.paths import check_file, find_mode, is_found_file, reading, resolve
 from splinecli.errors import InputError
+from splinecli.system.files import check_file, find_mode, is_found_file, reading, resolve
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")

@@ -19,8 +19,8 @@ from splinecli.capture.layouts.capture_files import (
     list_images,
 )
 from splinecli.capture.lights.light_files import read_light_directions
-from splinecli.capture.paths import is_folder, resolve
 from splinecli.errors import InputError
+from splinecli.system.files import is_folder, resolve
 
 TREES = ("PRPS", "PRPS_Diffuse")  # folders of objects in the published tree
 
@@ -33,12 +33,12 @@ _ENOUGH_MARKS = 2
 _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
-def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
     Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
     """
-    captures = list_captures(folder)
+    captures = list_cyclesps(folder)
     if captures is None:
         return None
     if not captures:
@@ -67,16 +67,16 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     )
 
 
-def capture_name(folder: Path) -> str | None:
+def cyclesps_name(folder: Path) -> str | None:
     """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
     try:
-        captures = list_captures(folder) if is_folder(folder) else None
+        captures = list_cyclesps(folder) if is_folder(folder) else None
     except InputError:  # reading the capture will raise it again
         return None
     return _name(captures[0]) if captures and len(captures) == 1 else None
 
 
-def list_captures(folder: Path) -> list[Path] | None:
+def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
     is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
     if not (is_images_folder or _has_marks(folder)) or find_named(folder, LIGHT_DIRECTIONS) is not None:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.layouts import cyclesps
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     GROUND_TRUTH,
@@ -25,8 +24,9 @@ from splinecli.capture.layouts.capture_files import (
     list_folder,
     list_images,
 )
-from splinecli.capture.paths import StrPath, is_folder
+from splinecli.capture.layouts.cyclesps import TREES, cyclesps_name, find_cyclesps, list_cyclesps
 from splinecli.errors import InputError
+from splinecli.system.files import StrPath, is_folder
 
 _WORD = re.compile(r"[a-z]+")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
@@ -50,7 +50,7 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
     overrides.named()
     try:
         # The plain folder comes last, because it takes any folder with images.
-        return _find_psbox(folder, overrides) or cyclesps.find(folder, overrides) or _find_plain(folder, overrides)
+        return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
     except NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
@@ -62,7 +62,7 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 def capture_name(folder: StrPath) -> str:
     """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
-    return folder.stem if is_film(folder) else cyclesps.capture_name(folder) or folder_name(folder)
+    return folder.stem if is_film(folder) else cyclesps_name(folder) or folder_name(folder)
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -100,13 +100,13 @@ def _captures_in(folder: Path) -> list[Path]:
             objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
         ):
             return [folder]
-    return cyclesps.list_captures(folder) or []
+    return list_cyclesps(folder) or []
 
 
 def _captures_below(folder: Path) -> list[Path]:
     """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
     try:
-        if folder.name in cyclesps.TREES:
+        if folder.name in TREES:
             return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
         return _captures_in(folder)
     except InputError:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.matlab import read_matrices
 from splinecli.capture.formats.text import MOST_TEXT, NumberRows, Row, check_length, read_text
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 SUFFIXES = (".npy", ".mat", ".yml", ".yaml", ".xml")
 

@@ -9,7 +9,7 @@ import numpy as np
 from splinecli.capture.formats.text import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 

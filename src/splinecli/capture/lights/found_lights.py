@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splinecli.errors import UsageError
-from splinecli.maths.arrays import Bools, Doubles, Singles
+from splinecli.maths import Bools, Doubles, Singles
 
 SIDES_DEG = {
     "right": 0.0,

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.capture.lights.array_files import SUFFIXES as ARRAY_SUFFIXES
 from splinecli.capture.lights.light_rows import read_light_rows
 from splinecli.capture.lights.named_lights import SUFFIXES as NAMED_SUFFIXES
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.paths import is_substitution
+from splinecli.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools
+from splinecli.maths import Bools
+from splinecli.system.files import is_substitution
 
 NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,12 +16,10 @@ from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
+from splinecli.capture.window import Window
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Bools, Doubles
+from splinecli.maths import Bools, Doubles
 from splinecli.maths.normals import unit
-
-if TYPE_CHECKING:
-    from splinecli.capture.source import CaptureSource
 
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
@@ -29,6 +27,21 @@ LOBES = ("light_lobes.txt",)
 _MOST_NARROW = 100  # the exponent of a lamp that has half of its light 7 degrees off its axis
 
 SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+
+
+class LitSource(Protocol):
+    """What lamps need to know of an opened capture; see CaptureSource."""
+
+    @property
+    def n_lights(self) -> int: ...
+    @property
+    def light_directions(self) -> Doubles: ...
+    @property
+    def light_frame(self) -> LightFrame: ...
+    @property
+    def intensities_measured(self) -> bool: ...
+    @property
+    def window(self) -> Window: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +110,7 @@ class LampFiles:
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
         return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
-    def over(self, source: CaptureSource, mask: Bools, *, step: int = 1) -> NearLamps | None:
+    def over(self, source: LitSource, mask: Bools, *, step: int = 1) -> NearLamps | None:
         """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
         window, frame, equal = source.window, source.light_frame, not source.intensities_measured
         if self.positions is not None:

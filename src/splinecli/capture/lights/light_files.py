@@ -21,10 +21,10 @@ from splinecli.capture.lights.light_rows import (
     read_light_rows,
     refuse_angles,
 )
-from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 from splinecli.maths.normals import unit
+from splinecli.system.files import StrPath
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
 _FILE = "a text file with a line {} for each image"

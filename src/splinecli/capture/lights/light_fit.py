@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
-from splinecli.maths.arrays import Doubles, Floats
+from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
+from splinecli.maths import Doubles, Floats
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
 

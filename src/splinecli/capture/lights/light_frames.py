@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from splinecli.errors import UsageError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 AXIS_WORDS = {
     "x-right": (0, 1),

@@ -10,7 +10,7 @@ import numpy as np
 
 from splinecli.capture.formats.text import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
 """The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""

@@ -21,7 +21,7 @@ from splinecli.capture.lights.light_files import lights_of, read_light_table, ro
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 from splinecli.system.files import parse_json
 
 SUFFIXES = (".lp", ".json")

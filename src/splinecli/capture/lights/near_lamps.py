@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import angle_between_deg
 
 _LEAST_SHARE = 0.05

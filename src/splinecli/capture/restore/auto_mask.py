@@ -3,7 +3,7 @@
 import numpy as np
 
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Singles
+from splinecli.maths import Bools, Singles
 
 LEAST_BORDER, LEAST_HOLE, LEAST_BRIGHT = 0.95, 0.05, 0.5
 """A mask is probably inverted if it has this share of the picture's border, leaves out this share of the picture, and

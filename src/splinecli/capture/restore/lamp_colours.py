@@ -7,9 +7,9 @@ The factors are found from the medians of the colours' changes, and each channel
 
 import numpy as np
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.maths.arrays import Doubles, Floats
+from splinecli import capture_warnings as codes
+from splinecli.capture_warnings import CaptureWarning
+from splinecli.maths import Doubles, Floats
 
 SAMPLE = 1500  # pixels of which the colours are compared
 

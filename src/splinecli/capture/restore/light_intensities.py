@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import fit_robustly, lit_values, shade, shadow_weights
-from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
+from splinecli.fits.robust import fit_robustly, lit_values, shade, shadow_weights
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import spread_of, unit
 
 Lights = Doubles | Callable[[Integers], Doubles]

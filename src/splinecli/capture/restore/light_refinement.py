@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
-from splinecli.capture.robust_fit import fit_robustly, lit_values
+from splinecli.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.errors import UsageError
-from splinecli.maths.arrays import Doubles, Floats, Singles
+from splinecli.fits.robust import fit_robustly, lit_values
+from splinecli.maths import Doubles, Floats, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 
 LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction

@@ -5,8 +5,8 @@ from functools import reduce
 
 import numpy as np
 
-from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, shade, shadow_weights
-from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
+from splinecli.fits.robust import absolute_weights, fit_scaled_normals, shade, shadow_weights
+from splinecli.maths import Array, Bools, Doubles, Integers, Singles
 
 ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 

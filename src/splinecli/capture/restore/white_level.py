@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.saturation import find_saturated, in_any_channel
+from splinecli.capture_warnings import WHITE_LEVEL, CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Array, Bools, Integers
+from splinecli.maths import Array, Bools, Integers
 
 Origin = Literal["given", "file", "images", "full scale"]
 
@@ -52,6 +53,14 @@ class WhiteLevel:
 
     value: float  # in the unit of the files, such as 4095
     origin: Origin  # given by the user, stated in the file, seen in the images, or the full scale of the files
+
+
+def white_level_warnings(level: WhiteLevel | None) -> list[CaptureWarning]:
+    """Warn of a white level that no file states, seen in the images."""
+    if level is None or level.origin != "images":
+        return []
+    text = f"The images look clipped at {level.value:g}, so this value counts as saturated."
+    return [CaptureWarning(WHITE_LEVEL, f"{text} Use --white-level N to set another value.")]
 
 
 _NOTHING = np.empty(0, np.int64)

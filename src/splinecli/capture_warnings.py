@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from splinecli.capture.restore.white_level import WhiteLevel
-from splinecli.maths.arrays import Doubles
+from splinecli.maths import Doubles
 
 
 @dataclass(frozen=True)
@@ -77,14 +76,6 @@ PROBABLY_WRONG = frozenset({
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 
 SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
-
-
-def white_level(level: WhiteLevel | None) -> list[CaptureWarning]:
-    """Warn of a white level that no file states, seen in the images."""
-    if level is None or level.origin != "images":
-        return []
-    text = f"The images look clipped at {level.value:g}, so this value counts as saturated."
-    return [CaptureWarning(WHITE_LEVEL, f"{text} Use --white-level N to set another value.")]
 
 
 def mask_inverted(name: str) -> CaptureWarning:
