@@ -152,7 +152,7 @@ class Bench:
 
     def calibration(self) -> dict[str, Cells]:
         from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
-        from splinecli.capture.lights.light_files import read_light_directions
+        from splinecli.capture.light_files import read_light_directions
         from splinecli.maths.normals import angle_between_deg
 
         probes = [self.data / f"psbox/LightProbe-{number}" for number in (1, 2)]

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
-from splinecli.diagnosis.frame_evidence import smooth_normals
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
-from splinecli.light.indirect_light import PixelPlaces
-from splinecli.light.lamp_light import LightOf, Rows, parts_of_rows
+from splinecli.lights.indirect_light import PixelPlaces
+from splinecli.lights.lamp_light import LightOf, Rows, parts_of_rows
+from splinecli.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
+from splinecli.lights.rough_normals import smooth_normals
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
-from splinecli.light.indirect_light import IndirectLight, find_indirect_light
-from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
+from splinecli.lights.indirect_light import IndirectLight, find_indirect_light
+from splinecli.lights.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence

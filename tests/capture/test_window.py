@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from splinecli.capture import open_capture
-from splinecli.capture.window import Window, parse_window
+from splinecli.capture.linearise import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
+from splinecli.lights.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import describe_capture

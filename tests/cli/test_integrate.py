@@ -10,7 +10,7 @@ import tifffile
 from PIL import Image
 
 from scenes import BUMP_LAMPS, write_bump
-from splinecli.capture.formats import image_size
+from splinecli.capture.formats import images as image_size
 from splinecli.maths.normals import encode_picture
 from splinecli.pipeline.infer import results_bytes
 

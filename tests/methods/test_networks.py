@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.light.lamp_light import LampLight, LightOf
+from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
 from splinecli.methods.estimator import for_capture

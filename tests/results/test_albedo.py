@@ -8,7 +8,7 @@ import pytest
 
 from scenes import square_grid, write_capture
 from splinecli.calibration.balls import find_ball_files
-from splinecli.calibration.gray import measure_light_intensities
+from splinecli.calibration.lamps import measure_light_intensities
 from splinecli.capture import open_capture
 from splinecli.results.albedo import albedo_map
 

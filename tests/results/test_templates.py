@@ -9,7 +9,7 @@ import numpy as np
 import tifffile
 
 from browser import OpenPage
-from splinecli.capture.layouts.result_names import NORMALS
+from splinecli.capture.result_names import NORMALS
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.report import html_report
 from splinecli.results.index import Entry, Row, index_page

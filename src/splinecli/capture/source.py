@@ -10,32 +10,36 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splinecli.capture.formats.damage import stderr_is_apart
+from splinecli.capture.files import CaptureFiles
+from splinecli.capture.formats.decoders import stderr_is_apart
 from splinecli.capture.formats.facts import ImageFacts, StoredSize
-from splinecli.capture.formats.image_size import ExpectedSize, check_memory, check_stored_size, common_size, image_bytes
-from splinecli.capture.formats.images import decode_image, read_mask
+from splinecli.capture.formats.images import (
+    ExpectedSize,
+    check_memory,
+    check_stored_size,
+    common_size,
+    decode_image,
+    image_bytes,
+    read_mask,
+)
 from splinecli.capture.formats.normal_files import read_ground_truth
-from splinecli.capture.layouts.capture_files import CaptureFiles
-from splinecli.capture.lights.found_lights import LightFinder
-from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
-from splinecli.capture.lights.lamp_files import LampFiles
-from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import (
     AS_STORED,
     EVERY_PIXEL,
+    WHOLE,
     RadiometricCalibration,
     StoredPixels,
+    Window,
     collect_observations,
     pixel_reader,
 )
-from splinecli.capture.record import Capture, check_light_indices
-from splinecli.capture.restore.auto_mask import find_object, looks_inverted, surrounds_hole
-from splinecli.capture.stored import StoredCapture
-from splinecli.capture.window import WHOLE, Window
+from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
+from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
 from splinecli.errors import InputError
 from splinecli.maths import Bools, Doubles, Integers
+from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")

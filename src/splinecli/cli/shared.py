@@ -37,7 +37,7 @@ Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
 
 def complete_sides() -> list[str]:
     """Return the sides that a first light may come from."""
-    from splinecli.capture.lights.found_lights import SIDES_DEG
+    from splinecli.capture.record import SIDES_DEG
 
     return [*SIDES_DEG]
 

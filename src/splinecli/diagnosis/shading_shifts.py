@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture.sample import Sample
+from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import fit_robustly, inverse_3x3, multiply_symmetric
 from splinecli.maths import Bools, Doubles
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
-from splinecli.capture.layouts.result_names import LIGHT_NOISE_PLOT, LIGHT_PLOT
+from splinecli.capture.result_names import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.errors import printable
 from splinecli.evaluation.capture_figures import CaptureFigure
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves

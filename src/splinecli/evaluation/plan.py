@@ -8,15 +8,15 @@ from typing import Any
 
 from splinecli import __version__
 from splinecli.capture import CaptureSource, capture_name
+from splinecli.capture.files import digest
 from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_draws
 from splinecli.capture.record import MIN_LIGHTS
-from splinecli.capture.restore.light_refinement import check_distant
-from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore
+from splinecli.lights.light_fit import check_distant
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 

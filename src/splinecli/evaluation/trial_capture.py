@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
 from splinecli.capture.lights.draws import NOISE_STREAM, PIXELS_STREAM
-from splinecli.capture.record import in_one_plane
-from splinecli.capture.restore.light_refinement import refine_capture
-from splinecli.capture.sample import sample_observations
-from splinecli.capture.stored import StoredCapture
+from splinecli.capture.record import StoredCapture, in_one_plane
 from splinecli.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
-from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.diagnosis.odd_images import check_ground_truth
+from splinecli.diagnosis.summary import sample_observations
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.inference import estimate_normals
-from splinecli.light.unknown_lights import find_lights
+from splinecli.lights.light_fit import refine_capture
+from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
-from splinecli.light.lamp_light import LightOf
+from splinecli.lights.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.estimator import (
     UNKNOWN_ERROR,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
-    from splinecli.light.lamp_light import LightOf
+    from splinecli.lights.lamp_light import LightOf
     from splinecli.refinement.refiner import NetworkRefiner
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities

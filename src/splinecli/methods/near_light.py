@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
+from splinecli.lights.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.methods import make_estimator
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
-from splinecli.light.lamp_light import LampLight, LightOf
+from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.observation_map import rotate_about_view_axis, sparse_map
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, directions_at

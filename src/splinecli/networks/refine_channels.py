@@ -17,7 +17,7 @@ WIDTHS = {
     "residual": 1,  # root mean square
     "dark_share": 1,  # share of dark observations
     "n_lights": 1,  # logarithm
-    "halves": 3,  # how two halves of the lights differ; the sign means nothing. See fits/two_halves.py
+    "halves": 3,  # how two halves of the lights differ; the sign means nothing. See TwoHalves
     "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of refinement/detail.py
 }
 """The features and their numbers of channels. Vectors have x and y first."""

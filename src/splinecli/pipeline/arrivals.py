@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from splinecli.capture.files import natural_key
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.layouts.capture_files import natural_key
 from splinecli.errors import InputError
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds

@@ -5,8 +5,8 @@ import re
 from pathlib import Path
 from typing import Literal
 
+from splinecli.capture.files import digest, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
-from splinecli.capture.stamp import digest, stamp_content
 from splinecli.errors import OutputError, UsageError
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.infer_options import Reading

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.formats.image_size import check_memory
-from splinecli.capture.layouts.result_names import FOUND_MASK, LIGHT_FILES, PAGE
+from splinecli.capture.files import digest
+from splinecli.capture.formats.images import check_memory
 from splinecli.capture.lights.draws import draw_lights
-from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.capture.result_names import FOUND_MASK, LIGHT_FILES, PAGE
 from splinecli.capture.source import BYTES_OF_RESULTS
-from splinecli.capture.stamp import digest
 from splinecli.diagnosis.checks import check_capture
 from splinecli.errors import OutputError, UsageError
 from splinecli.inference import NormalEstimate
+from splinecli.lights.light_fit import refine_capture
 from splinecli.methods import Estimator, make_estimator
 from splinecli.methods.estimator import tells_confidence
 from splinecli.pictures.light_sky import sky_plot

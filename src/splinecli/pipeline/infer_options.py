@@ -10,23 +10,21 @@ from pathlib import Path
 from typing import Any, get_args
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.layouts.capture_files import check_not_empty, list_images
-from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
+from splinecli.capture.files import check_not_empty, list_images
+from splinecli.capture.light_rows import LightForm, parse_light_frame
 from splinecli.capture.lights.draws import check_draw_settings
-from splinecli.capture.lights.found_lights import ESTIMATE, LightFinder, azimuth_of
-from splinecli.capture.lights.lamp_files import LampOptions
-from splinecli.capture.lights.light_frames import parse_light_frame
-from splinecli.capture.lights.light_rows import LightForm
+from splinecli.capture.linearise import parse_window
+from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import check_light_indices
-from splinecli.capture.restore.white_level import check_white_level
-from splinecli.capture.window import parse_window
+from splinecli.capture.record import ESTIMATE, LightFinder, azimuth_of, check_light_indices
+from splinecli.capture.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
 from splinecli.pipeline.surface import check_pixel_size
+from splinecli.restoration.images import check_white_level
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file
@@ -130,7 +128,7 @@ class Reading:
         """Open the capture in the folder under these options. Raises InputError."""
         find: LightFinder | None = None
         if self.finds_lights:
-            from splinecli.light.unknown_lights import find_lights
+            from splinecli.lights.unknown_lights import find_lights
 
             find = partial(find_lights, first_light=self.first_light)
 
@@ -160,7 +158,7 @@ class InferOptions(Reading):
     Args:
         n_lights: None for all. light_indices: counted from 0.
         distil: False for the method on every pixel, None for distillation of large captures only.
-        formats, maps: names of `splinecli.capture.layouts.result_names.NORMALS` and MAPS.
+        formats, maps: names of `splinecli.capture.result_names.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
     """
 

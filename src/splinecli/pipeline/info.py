@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture.lights.found_lights import FoundLights
-from splinecli.capture.lights.named_lights import check_writable, encode_lights
-from splinecli.capture.summary import CaptureSummary, summarise_capture
+from splinecli.capture.light_files import check_writable, encode_lights
+from splinecli.capture.record import FoundLights
 from splinecli.capture_warnings import estimated_lights
 from splinecli.diagnosis.checks import check_evidence
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
+from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.student_size import student_sizes
 from splinecli.pictures.light_sky import sky_plot

@@ -10,10 +10,10 @@ from typing import Any, get_args
 import numpy as np
 
 from splinecli.capture import read_image, read_normal_map
-from splinecli.capture.formats.image_size import ExpectedSize, check_memory
+from splinecli.capture.formats.images import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
-from splinecli.capture.layouts.result_names import ALBEDO_PICTURE, NORMALS, REPORT
-from splinecli.capture.lights.lamp_files import read_camera_matrix
+from splinecli.capture.near_lamps import read_camera_matrix
+from splinecli.capture.result_names import ALBEDO_PICTURE, NORMALS, REPORT
 from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.pipeline.surface import BYTES_OF_SURFACE, check_pixel_size, make_surface, view_of_report

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 from splinecli import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.layouts.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
+from splinecli.capture.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, method_names
 from splinecli.pipeline.films import unpacked

@@ -6,7 +6,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.layouts.result_names import CONTACT_SHEET
+from splinecli.capture.result_names import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png

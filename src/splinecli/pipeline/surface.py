@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.window import parse_window
+from splinecli.capture.linearise import parse_window
 from splinecli.errors import UsageError
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.integration import integrate_normals

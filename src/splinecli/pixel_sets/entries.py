@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splinecli.capture import capture_name, open_capture
-from splinecli.capture.stamp import digest
-from splinecli.capture.stored import name_reading
+from splinecli.capture.files import digest
+from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter

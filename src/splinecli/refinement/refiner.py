@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.fits.least_squares import alternating_signs
-from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.lights.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
 from splinecli.networks.refine_channels import CHANNELS, channels
 from splinecli.networks.refine_net import COARSEST, Part, RefineNet, unit_maps

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.capture.layouts.result_names import (
+from splinecli.capture.light_files import rows_text
+from splinecli.capture.result_names import (
     ALBEDO,
     ALBEDO_EXR,
     ALBEDO_PICTURE,
@@ -37,7 +38,6 @@ from splinecli.capture.layouts.result_names import (
     RELIEF_TIFF,
     REPORT,
 )
-from splinecli.capture.lights.light_files import rows_text
 from splinecli.maths.normals import Convention, curvature_of_normals, describe, encode_picture, gradient_of_normals
 from splinecli.pictures.maps import (
     albedo_picture,

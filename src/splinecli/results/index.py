@@ -11,9 +11,8 @@ from urllib.parse import quote
 import numpy as np
 
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.image_size import image_bytes
-from splinecli.capture.formats.images import decode_image
-from splinecli.capture.layouts.result_names import NORMALS, PAGE, REPORT
+from splinecli.capture.formats.images import decode_image, image_bytes
+from splinecli.capture.result_names import NORMALS, PAGE, REPORT
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import read_report
 from splinecli.results.templates import picture_url, render

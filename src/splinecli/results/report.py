@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
-from splinecli.capture.stored import name_reading
+from splinecli.capture.record import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 

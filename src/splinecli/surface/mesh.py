@@ -37,7 +37,7 @@ class SurfaceMesh:
     uvs: Singles
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
-    # exact. See decimation.py.
+    # exact.
     normal_texture: NDArray[np.uint8] | None = None
     tangents: Singles | None = None  # (V, 3) float32, unit, where there is a normal texture
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.layouts.result_names import CURVES, TRAINING_MAPS
+from splinecli.capture.result_names import CURVES, TRAINING_MAPS
 from splinecli.errors import OutputError
 from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.plotting import png_bytes

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
-from splinecli.capture.formats.image_size import check_stored_size
+from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
+from splinecli.capture.formats.images import check_stored_size
 from splinecli.errors import InputError
 from splinecli.maths import Singles
 from splinecli.maths.normals import unit

@@ -18,12 +18,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
+from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
-from splinecli.capture.formats.images import cut_out, decode_image, decode_with_alpha, read_mask
-from splinecli.capture.formats.matlab import read_mat
-from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
+from splinecli.capture.formats.images import (
+    ExpectedSize,
+    check_stored_size,
+    check_vectors,
+    cut_out,
+    decode_image,
+    decode_with_alpha,
+    read_mask,
+)
+from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Doubles, Singles
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit

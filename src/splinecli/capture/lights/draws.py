@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture.formats.text import read_lines, split_words
+from splinecli.capture.formats.numbers import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Doubles
