@@ -114,7 +114,7 @@ class Bench:
     def confidence(self, capture: str) -> Cells:
         """In percent: pixels within 5 degrees as expected and found; the worst tenth's share in the least sure."""
         from splinecli.capture import open_capture
-        from splinecli.capture.lights.draws import draw_lights
+        from splinecli.evaluation.protocol import draw_lights
         from splinecli.inference import estimate_normals
         from splinecli.methods import make_estimator
 

@@ -21,10 +21,10 @@ from scipy.optimize import minimize
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
 from splinecli.capture import Capture, open_capture
-from splinecli.capture.lights.draws import draw_lights
 from splinecli.diagnosis.checks import check_arrays, check_capture
 from splinecli.diagnosis.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
 from splinecli.diagnosis.summary import Sample
+from splinecli.evaluation.protocol import draw_lights
 from splinecli.maths.transfer import encode_srgb
 from splinecli.restoration.lamps import estimate_light_intensities
 from splinecli.synthesis.meshes import Mesh

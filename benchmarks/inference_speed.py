@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import torch
 
-from splinecli.methods.networks import NetworkEstimator, Precision
+from splinecli.methods.batched import NetworkEstimator, Precision
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork, resolve_weights

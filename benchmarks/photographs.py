@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
-from splinecli.capture.lights.draws import draw_lights
+from splinecli.evaluation.protocol import draw_lights
 from splinecli.maths.normals import angle_between_deg
-from splinecli.networks.capture_context import sample_of
+from splinecli.networks.set_branch import sample_of
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights
 from splinecli.restoration.images import restore_saturated

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
 from splinecli.capture.light_rows import parse_light_frame
-from splinecli.capture.lights.draws import draw_lights
 from splinecli.diagnosis.light_check import LightCheck, check_lights, mirror_twin
 from splinecli.diagnosis.light_order import UNKNOWN_ORDER
 from splinecli.diagnosis.summary import sample_observations
+from splinecli.evaluation.protocol import draw_lights
 from splinecli.lights.light_fit import find_factors
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 

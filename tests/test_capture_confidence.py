@@ -15,7 +15,7 @@ from splinecli.lights.lamp_light import LampLight
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.networks.error_head import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
+from splinecli.networks.li_ne_net import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.networks.weights import capture_head, manifest
 
 Doubles = NDArray[np.float64]

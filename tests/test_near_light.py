@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 import splinecli
 from scenes import spiral_lights
+from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.linearise import Window
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.inference import estimate_normals
+from splinecli.inference import Blocks, estimate_normals, find_surface
 from splinecli.maths.normals import unit
-from splinecli.methods import make_estimator, near_light
-from splinecli.methods.near_light import Blocks, find_surface
+from splinecli.methods import make_estimator
 from splinecli.surface.pixel_grid import pixel_rays
 
 Floats = NDArray[np.float64]
@@ -149,7 +149,7 @@ def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, 
 def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPatch) -> None:
     capture = near("dome", 4.0, side=101)
     whole = find_surface(capture).lamps
-    monkeypatch.setattr(near_light, "PIXELS_ON_THE_WAY", 900)
+    monkeypatch.setattr(inference, "PIXELS_ON_THE_WAY", 900)
     assert Blocks.over(capture.mask, 900).step == 3
     reduced = find_surface(capture).lamps
     assert np.abs(reduced.points - whole.points).mean() < 0.01

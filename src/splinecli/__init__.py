@@ -105,7 +105,7 @@ def estimate_normals(
     from splinecli.diagnosis.checks import check_arrays
     from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator
-    from splinecli.pipeline.estimate import estimate_capture
+    from splinecli.pipeline.infer import estimate_capture
 
     check_method(method)
     find: LightFinder | None = None

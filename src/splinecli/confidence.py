@@ -52,7 +52,7 @@ def correct_errors(
 
     Args:
         light_of: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
     """
     import torch
 
@@ -158,7 +158,7 @@ def capture_features(
     Args:
         mask: (H, W), with P true pixels.
         light_of: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
         lights: (F, 3), unit; of near lamps, at the origin.
     """
     n_lights = len(lights)

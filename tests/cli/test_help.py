@@ -12,7 +12,7 @@ import typer
 from make_pages import EXAMPLES, FILES, man_pages
 from splinecli.capture.result_names import OWN_FILES
 from splinecli.cli.main import app
-from splinecli.results.index import INDEX
+from splinecli.results.pages import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

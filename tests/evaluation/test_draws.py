@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splinecli.capture.lights.draws import draw_lights, read_draws
 from splinecli.errors import InputError, UsageError
+from splinecli.evaluation.protocol import draw_lights, read_draws
 from splinecli.maths.normals import unit
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from splinecli.capture import Capture
 from splinecli.capture.record import StoredCapture
-from splinecli.evaluation.trial_capture import scored_rows, tilt_lights
+from splinecli.evaluation.trials import scored_rows, tilt_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.restoration.images import Saturation
 

@@ -7,8 +7,7 @@ import pytest
 
 from scenes import evaluate, shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
-from splinecli.capture.lights.draws import draw_lights
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Protocol, draw_lights
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.inference import estimate_normals

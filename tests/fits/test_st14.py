@@ -9,7 +9,7 @@ from scenes import cap_directions, halfway
 from splinecli.fits.st14 import solve_st14
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from splinecli.lights.indirect_light import IndirectLight, find_indirect_light
 from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.networks import NetworkEstimator
-from splinecli.networks.refine_channels import channels
+from splinecli.methods.batched import NetworkEstimator
+from splinecli.networks.refine_net import channels
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
 from splinecli.training.refinement import pixel_features

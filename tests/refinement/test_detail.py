@@ -8,7 +8,7 @@ from torch.nn.functional import normalize, pad
 
 from conftest import directions_at, spiral_lights
 from splinecli.fits.least_squares import alternating_signs
-from splinecli.networks.refine_channels import CHANNELS, channels
+from splinecli.networks.refine_net import CHANNELS, channels
 from splinecli.refinement.detail import REACH, restore_detail
 from splinecli.refinement.features import refine_features
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scenes import evaluate, spiral_lights
 from splinecli.capture import Capture, read_capture
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.trial_capture import scored_rows
+from splinecli.evaluation.trials import scored_rows
 from splinecli.inference import estimate_normals
 from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import unit
+from splinecli.methods.batched import NetworkEstimator
 from splinecli.methods.estimator import UNKNOWN_ERROR
-from splinecli.methods.networks import NetworkEstimator
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.refine_net import RefineNet
 from splinecli.networks.spline_net import SplineNet

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from scenes import shade, sphere_cap, write_capture
-from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.reader import open_capture
+from splinecli.evaluation.protocol import draw_lights
 from splinecli.fits.robust import fit_scaled_normals
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.restoration.lamps import estimate_light_intensities

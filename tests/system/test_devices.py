@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from splinecli.errors import UsageError
-from splinecli.system import machine as devices
-from splinecli.system import machine as memory
+from splinecli.system import machine as machine_module
 from splinecli.system.machine import (
     available_memory,
     cgroup_quotas,
@@ -55,8 +54,8 @@ def write(path: Path, text: str) -> None:
 @pytest.fixture
 def mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of control groups, beside the file `groups` that says in which ones this process is."""
-    monkeypatch.setattr(memory, "_GROUPS", tmp_path / "groups")
-    monkeypatch.setattr(memory, "_MOUNT", tmp_path / "mount")
+    monkeypatch.setattr(machine_module, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(machine_module, "_MOUNT", tmp_path / "mount")
     return tmp_path / "mount"
 
 
@@ -98,8 +97,8 @@ def test_quotas_of_control_groups(mount: Path, case: str) -> None:
 
 def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A job of Slurm or systemd is in a group within groups. Each of them may have a limit."""
-    monkeypatch.setattr(memory, "_free_memory", lambda: 9e9)
-    monkeypatch.setattr(memory, "_left_in_address_space", lambda: 8e9)
+    monkeypatch.setattr(machine_module, "_free_memory", lambda: 9e9)
+    monkeypatch.setattr(machine_module, "_left_in_address_space", lambda: 8e9)
     assert available_memory() == 8e9
     enter(mount, "0::/jobs/ours\n")
     write(mount / "jobs/ours/memory.max", "max\n")
@@ -112,8 +111,8 @@ def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_free_memory", lambda: 8e9)
-    monkeypatch.setattr(memory, "_left_in_address_space", lambda: 9e9)
+    monkeypatch.setattr(machine_module, "_free_memory", lambda: 8e9)
+    monkeypatch.setattr(machine_module, "_left_in_address_space", lambda: 9e9)
     enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
     for group, limit in (("", 9223372036854771712), ("box", 5000), ("box/ours", 9223372036854771712)):
         write(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
@@ -129,9 +128,9 @@ def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: py
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
 def test_available_cores(machine, affinity, quotas, expected, monkeypatch):
-    monkeypatch.setattr(devices.os, "cpu_count", lambda: machine)
-    monkeypatch.setattr(devices.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
-    monkeypatch.setattr(devices, "cgroup_quotas", lambda: quotas)
+    monkeypatch.setattr(machine_module.os, "cpu_count", lambda: machine)
+    monkeypatch.setattr(machine_module.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+    monkeypatch.setattr(machine_module, "cgroup_quotas", lambda: quotas)
     assert count_available_cores() == expected
 
 
@@ -140,6 +139,6 @@ def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     now = [threads]
     monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
     monkeypatch.setattr(torch, "set_num_threads", lambda count: now.__setitem__(0, count))
-    monkeypatch.setattr(devices, "count_available_cores", lambda: cores)
+    monkeypatch.setattr(machine_module, "count_available_cores", lambda: cores)
     use_available_cores()
     assert now[0] == expected

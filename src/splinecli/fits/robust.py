@@ -52,8 +52,6 @@ def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[A
 
 def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F), pixel by pixel."""
-    import numpy as np
-
     x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
     entries = [np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
     right_side = [np.einsum("pf,pf->p", axis, values) for axis in (x, y, z)]

@@ -60,7 +60,7 @@ def method_names() -> list[str]:
 
 
 def _least_squares(*_: object) -> Estimator:
-    from splinecli.methods.least_squares import LeastSquares
+    from splinecli.methods.estimator import LeastSquares
 
     return LeastSquares()
 
@@ -77,7 +77,7 @@ def _solver(name: str, options: MethodOptions, *, fit: str, batch_size: int) -> 
 
 
 def _network(name: str, options: MethodOptions, *, weights: str, rotations: int, refines: bool = True) -> Estimator:
-    from splinecli.methods.networks import NetworkEstimator
+    from splinecli.methods.batched import NetworkEstimator
     from splinecli.networks.weights import resolve_weights
     from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 

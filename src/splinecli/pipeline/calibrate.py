@@ -14,8 +14,7 @@ from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.capture.result_names import CALIBRATION
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.pictures.calibration import calibration_picture
-from splinecli.pictures.png import encode_png
+from splinecli.pictures.maps import calibration_picture, encode_png
 from splinecli.system.files import check_free
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files

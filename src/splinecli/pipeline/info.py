@@ -15,12 +15,11 @@ from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.student_size import student_sizes
-from splinecli.pictures.light_sky import sky_plot
-from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
-from splinecli.pipeline.estimate import AUTOMATIC_FROM
-from splinecli.pipeline.films import unpacked
-from splinecli.pipeline.infer_options import Reading
+from splinecli.methods.estimator import student_sizes
+from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.incoming import unpacked
+from splinecli.pipeline.infer import AUTOMATIC_FROM
+from splinecli.pipeline.infer_options import BASE_BYTES, Reading, infer_bytes
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 

@@ -8,10 +8,8 @@ from typing import Any
 
 from splinecli.capture.result_names import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
-from splinecli.pictures.contact_sheet import contact_sheet
-from splinecli.pictures.png import encode_png
-from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pictures.maps import contact_sheet, encode_png
+from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
 from splinecli.pixel_sets.entries import (
     CaptureChangedError,
     ScenePlan,

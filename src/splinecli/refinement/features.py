@@ -17,7 +17,7 @@ from splinecli.fits.least_squares import (
     weighted_sum,
 )
 from splinecli.maths.observation_map import dot, map_scale
-from splinecli.networks.refine_channels import MEDIAN_OFFSET, TENSOR, VECTORS, WIDTHS
+from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
 
 _LARGEST_LOG = 4.0
 _HALVES_SCALE = 3.0  # brings these small numbers near the others
@@ -27,13 +27,13 @@ _HALVES_SCALE = 3.0  # brings these small numbers near the others
 def refine_features(
     observations: Tensor, light_directions: Tensor, normals: Tensor, error: Tensor, reference: float, signs: Tensor
 ) -> Tensor:
-    """Return the features (P, CHANNELS) of pixels in the order of WIDTHS, each about -1 to 1.
+    """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to 1.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
         light_directions: (F, 3) or (P, F, 3), unit.
         normals: (P, 3), unit.
-        error: (P, 2), see networks/error_head.py.
+        error: (P, 2), see networks/li_ne_net.py.
         reference: the brightness of the capture, see `brightness`.
         signs: (F,), the halves of the capture's lights, see alternating_signs of fits/least_squares.py.
     """
@@ -69,7 +69,7 @@ def refine_features(
         "halves": (_HALVES_SCALE * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
     }
-    return torch.cat([features[name] for name in WIDTHS], dim=1)
+    return torch.cat([features[name] for name in FEATURE_WIDTHS], dim=1)
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:

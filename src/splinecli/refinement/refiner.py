@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from splinecli.fits.least_squares import alternating_signs
 from splinecli.lights.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
-from splinecli.networks.refine_channels import CHANNELS, channels
-from splinecli.networks.refine_net import COARSEST, Part, RefineNet, unit_maps
+from splinecli.networks.refine_net import CHANNELS, COARSEST, Part, RefineNet, channels, unit_maps
 from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
@@ -99,7 +98,7 @@ class NetworkRefiner:
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
-        A pixel that is dark under every light stays as it is. See networks/error_head.py for the distributions.
+        A pixel that is dark under every light stays as it is. See networks/li_ne_net.py for the distributions.
 
         Args:
             mask: (H, W), with P true pixels.

@@ -135,8 +135,6 @@ def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
 
 
 def _encode_exr(surface: Surface) -> bytes:
-    import numpy as np
-
     low = np.nanmin(surface.depth)
     heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)
     return encode_exr(heights, {"unit": surface.unit, "outside": f"{low:.7g}"})
@@ -147,7 +145,6 @@ def _encode_png(surface: Surface) -> bytes:
 
     The text `depth` of the PNG file has these values and their unit.
     """
-    import numpy as np
     from PIL import Image, PngImagePlugin
 
     low, high = float(np.nanmin(surface.depth)), float(np.nanmax(surface.depth))
@@ -171,7 +168,6 @@ _ENCODERS: dict[str, Callable[[Surface], Content]] = {
 
 
 def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
-    import numpy as np
     import trimesh
 
     return trimesh.Trimesh(
@@ -197,8 +193,6 @@ def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
 
     Without them, viewers derive their own tangents in different ways.
     """
-    import numpy as np
-
     tangents = mesh.tangents
     if tangents is None:
         return None
