@@ -33,7 +33,6 @@ FEWEST_PIXELS = 50
 _SAMPLE = 1500  # pixels
 _FACTOR_SAMPLE = 1000
 _BLOCKS = 2500  # over which normals are averaged for their curl
-_BRIGHT_QUANTILE = 0.95
 _DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
 _FITS = 4
 _DECODING = 2.2  # an exponent close to the curve of sRGB
@@ -167,7 +166,7 @@ def capture_features(
     rows = np.arange(0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
     light = light_of(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
-    bright = float(np.quantile(brightness, _BRIGHT_QUANTILE))
+    bright = float(np.quantile(brightness, 0.95))
     kept = brightness > _DARK_SHARE * bright
     if np.count_nonzero(kept) < FEWEST_PIXELS:
         return None

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from make_pages import EXAMPLES, FILES, man_pages
-from splinecli.capture.result_names import OWN_FILES
+from splinecli.capture.files import OWN_FILES
 from splinecli.cli.main import app
 from splinecli.results.pages import INDEX
 

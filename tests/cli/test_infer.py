@@ -16,8 +16,16 @@ import pytest
 import tifffile
 
 from cli.conftest import EXAMPLE, read_report
-from splinecli.capture.files import IMAGE_SUFFIXES
-from splinecli.capture.result_names import CONFIDENCE_PICTURE, ERROR_MAP, FOUND_MASK, LIGHT_PLOT, MAPS, NORMALS, PLOTS
+from splinecli.capture.files import (
+    CONFIDENCE_PICTURE,
+    ERROR_MAP,
+    FOUND_MASK,
+    IMAGE_SUFFIXES,
+    LIGHT_PLOT,
+    MAPS,
+    NORMALS,
+    PLOTS,
+)
 from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.estimator import LeastSquares
 from splinecli.surface.surface_files import SURFACE_FILES

@@ -9,7 +9,7 @@ import numpy as np
 import tifffile
 
 from browser import OpenPage
-from splinecli.capture.result_names import NORMALS
+from splinecli.capture.files import NORMALS
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.results.pages import Entry, Row, index_page

@@ -116,8 +116,6 @@ the outlines does not: under a distant camera."""
 
 CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
-_DRAWS = 200
-
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
@@ -152,7 +150,7 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
     view = balls[0].view
     positions, pixel_size, miss = _positions(balls, view.matrix, ball_diameter)
     generator = np.random.default_rng(0)
-    drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(_DRAWS)]
+    drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
     # Each draw adds as much to the misses as the pixels had added to those of the images, if PIXEL_ERROR is right.

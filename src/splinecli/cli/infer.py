@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 from typer import Argument, Option
 
+from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.capture.formats.numbers import to_number
-from splinecli.capture.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines, print_report, printed_documents

@@ -244,7 +244,6 @@ nearly as a shift does."""
 
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
 _MOST_PIXELS = 4000  # of each comparison
-_LEAST_OVERLAP = 0.5
 
 
 def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
@@ -323,7 +322,7 @@ def _angles_deg(normals: Doubles, truth: Floats, shift: tuple[int, int]) -> tupl
     there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
     moved = truth[there]
     known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
-    if np.count_nonzero(known) < max(1, _LEAST_OVERLAP * np.count_nonzero(normals.any(axis=2))):
+    if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
         return 180.0, 0.0
     every = slice(None, None, -(-int(np.count_nonzero(known)) // _MOST_PIXELS))
     own = normals[here][known][every]

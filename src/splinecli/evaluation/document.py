@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
-from splinecli.capture.result_names import LIGHT_NOISE_PLOT, LIGHT_PLOT
+from splinecli.capture.files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.errors import printable
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import (

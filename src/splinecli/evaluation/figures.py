@@ -36,8 +36,6 @@ MOST_CAPTURES = 4
 """Number of captures up to which each has a panel. With more, only the average has one, so that it can be read."""
 
 _PANEL_INCHES = (3.2, 2.7)
-_MOST_ACROSS = 3
-_DPI = 200
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
 _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
@@ -100,7 +98,7 @@ def _curves(
     shown = [*captures, AVERAGE] if 1 < len(captures) <= MOST_CAPTURES else [AVERAGE]
     styles = method_styles(evaluations[0].methods)
     dashes = {name: _DASHES[i % len(_DASHES)] for i, name in enumerate(dict.fromkeys(map(series, evaluations)))}
-    across = 2 if len(shown) == 4 else min(len(shown), _MOST_ACROSS)
+    across = 2 if len(shown) == 4 else min(len(shown), 3)
     down = math.ceil(len(shown) / across)
 
     figure = Figure(figsize=(_PANEL_INCHES[0] * across, _PANEL_INCHES[1] * down + 0.4), layout="constrained")
@@ -135,7 +133,7 @@ def _curves(
         handles += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()]
     columns = min(len(handles), 2 * across)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=_SMALL)
-    return png_bytes(figure, _DPI)
+    return png_bytes(figure, 200)
 
 
 def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, float]:

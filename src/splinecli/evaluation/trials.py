@@ -142,7 +142,6 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
 
 
-_RETILTS = 100
 _LARGEST_TILT_DEG = 89.0
 OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
@@ -229,7 +228,7 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
     """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
     generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
     # Few lights and much noise can give lights in one plane. Such noise is drawn again.
-    for _ in range(_RETILTS):
+    for _ in range(100):
         directions = tilt_lights(capture.light_directions, trial.protocol.light_noise_deg, generator)
         if not in_one_plane(directions):
             break

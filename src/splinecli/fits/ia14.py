@@ -14,7 +14,6 @@ from splinecli.fits.least_squares import lit_observations
 DEGREE_OBSERVATION = 2  # N1 in the paper
 DEGREE_LIGHT = 4  # N2 in the paper
 SHADOW_SHARE = 0.2  # of the pixel's quantile UNSHADED; observations below it are left out as shadows
-_MOST_EXCHANGES = 100
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
@@ -117,7 +116,7 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
     fewest_wrong = linear.new_full((count,), size + 1)
     patience = linear.new_full((count,), 3)
     x = torch.zeros_like(linear)
-    for _ in range(_MOST_EXCHANGES):
+    for _ in range(100):
         system = torch.where(free[:, :, None] & free[:, None, :], hessian, eye)
         right_side = torch.where(free, linear, 0)[..., None]
         x = torch.cholesky_solve(right_side, torch.linalg.cholesky(system))[..., 0]

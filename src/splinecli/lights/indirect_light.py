@@ -30,7 +30,6 @@ NEGLIGIBLE = 0.02
 _BLOCKS = 1200  # parts of the surface that exchange light
 
 _SHADOW_PIXELS = 50_000
-_FEWEST_SHADOWS = 50
 _SHADOW_COSINE = -0.05
 """Attached shadows are looked for at about so many pixels, and so many are needed. There, the cosine of the angle
 between light and normal is below the last number."""
@@ -175,7 +174,7 @@ def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, 
         albedo = np.broadcast_to(indirect.albedo[rows, None], shadow.shape)
         found.append(np.stack((observations[rows][shadow], gathered[shadow], albedo[shadow])))
     seen, gathered, albedo = np.hstack(found).astype(np.float64)
-    if len(seen) < _FEWEST_SHADOWS:
+    if len(seen) < 50:
         return None
     with np.errstate(invalid="ignore"):  # black shadows have no correlation
         correlation = np.corrcoef(seen, gathered)[0, 1]

@@ -43,7 +43,6 @@ INTENSITY_LIMITS = (0.1, 10.0)
 
 _ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
 _PRIOR = 1e-9
-_FITS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +159,7 @@ def fit_residual(values: Doubles, light_directions: Doubles) -> float:
     It is a share of the mean of the lit values.
     """
     lit = (values > LIT_SHARE).astype(np.float64)
-    normals, _ = fit_robustly(values, lit, light_directions, _FITS)
+    normals, _ = fit_robustly(values, lit, light_directions, 5)
     residuals = values - normals @ light_directions.T
     return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
 
@@ -197,16 +196,11 @@ suggested. Few matte or shiny captures with exact lights have more."""
 
 INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
 
-_MAX_PIXELS = 2000
 _MIN_PIXELS = 100
-_DARK_SHARE = 0.02
 _SHADOW_SHARE = 0.1  # of the pixel's quantile below, as in IW12
-_UNSHADED = 0.6
 _WORTH_PIXELS = 50.0  # see fit_near
 
-_MAX_ROUNDS = 150
 _FIRST_FITS, _FITS_PER_ROUND = 8, 2
-_CONVERGED = 1e-4
 
 
 class LightFit(NamedTuple):
@@ -344,18 +338,18 @@ def fit_near(
     values = _choose_pixels(observations)
     if values is None:
         return None
-    reference = _SHADOW_SHARE * np.quantile(values, _UNSHADED, axis=1, keepdims=True)
+    reference = _SHADOW_SHARE * np.quantile(values, 0.6, axis=1, keepdims=True)
     lit = (values > reference).astype(np.float64)
     lights = light_directions
     normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)
     before = _misfit(values, normals, lights, lit)
     precision = _prior(light_directions, error_deg, intensity_error or INTENSITY_ERROR)
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(150):
         normals, weights = fit_robustly(values, lit, lights, _FITS_PER_ROUND, weights)
         moved = _move_lights(values, normals, weights, lights, light_directions, precision, worth_pixels)
         moved = moved if intensity_error else unit(moved)
         change, lights = np.abs(moved - lights).max(), moved
-        if change < _CONVERGED:
+        if change < 1e-4:
             break
     normals, _ = fit_robustly(values, lit, lights, _FIRST_FITS, weights)
     after = _misfit(values, normals, lights, lit)
@@ -366,7 +360,7 @@ def _choose_pixels(observations: Singles) -> Doubles | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
     if observations.shape[1] < MIN_LIGHTS:
         return None
-    _, values = lit_values(observations, _DARK_SHARE, _MAX_PIXELS)
+    _, values = lit_values(observations, 0.02, 2000)
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 

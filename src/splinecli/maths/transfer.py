@@ -76,7 +76,6 @@ def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArra
 
 LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Those of cameras and screens have a few kilobytes.
 
-_MOST_TAGS = 100
 _SAMPLES = 4096  # of a curve that has no name
 _SAME = 1e-3  # difference of linear values below which two curves count as one
 
@@ -102,7 +101,7 @@ def _tags(profile: bytes) -> dict[bytes, bytes]:
     if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
         raise ValueError
     (count,) = struct.unpack_from(">I", profile, 128)
-    places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, _MOST_TAGS))]
+    places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))]
     return {name: profile[start : start + length] for name, start, length in places}
 
 

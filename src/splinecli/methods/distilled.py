@@ -118,9 +118,7 @@ def _rank_in_group(groups: Tensor) -> Tensor:
 
 BATCH = 256
 _LEARNING_RATE = 3e-3
-_WEIGHT_DECAY = 1e-4
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
-_WEIGHT_OF_ERRORS = 0.05
 
 
 class Perceptron(nn.Module):
@@ -191,7 +189,7 @@ class Perceptron(nn.Module):
         self.mean.copy_(inputs.mean(dim=0))
         self.spread.copy_(inputs.std(dim=0) + 1e-3)
         optimiser = torch.optim.AdamW(
-            self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99), fused=True
+            self.parameters(), lr=_LEARNING_RATE, weight_decay=1e-4, betas=(0.9, 0.99), fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _LEARNING_RATE, total_steps=steps + 1, pct_start=0.1)
         order = torch.empty(0, dtype=torch.long)
@@ -202,7 +200,7 @@ class Perceptron(nn.Module):
             found, found_errors = self(inputs[rows])
             # The angle, not its square: the estimator's own outliers must not draw the normals of other pixels.
             angle = (((found - normals[rows]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
-            loss = angle.mean() + _WEIGHT_OF_ERRORS * (found_errors - errors[rows]).square().mean()
+            loss = angle.mean() + 0.05 * (found_errors - errors[rows]).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

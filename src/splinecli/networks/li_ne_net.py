@@ -103,7 +103,6 @@ def median_error_deg(error: Tensor) -> Tensor:
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features of confidence.py
 _BEND_TURN = 11  # the place of CaptureFeatures.bend_turn
-_CAPTURE_HIDDEN = 24
 _MOST = 4.0  # standard deviations of a feature from its mean
 _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES
 _NO_ERROR = -3.5  # logarithm of the median error, in radians, that is added before training
@@ -120,7 +119,7 @@ class CaptureHead(nn.Module):
     mean: Tensor
     spread: Tensor
 
-    def __init__(self, hidden: int = _CAPTURE_HIDDEN) -> None:
+    def __init__(self, hidden: int = 24) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(_INPUTS))
         self.register_buffer("spread", torch.ones(_INPUTS))

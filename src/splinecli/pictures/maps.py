@@ -168,7 +168,6 @@ def _paste(panel: Picture, gray: Picture, y: int, x: int) -> None:
 BALL_TILE = 200  # width and height of one ball in the picture, in pixels
 _MARGIN = 1.15  # half of a tile's width, in radii of the ball
 _CAPTION = 22  # height of the caption below each tile
-_COLUMNS = 6
 _BRIGHTENING = 0.4  # exponent; makes the outline of a dark ball visible
 _GREEN, _RED, _GRAY = (90, 200, 90), (255, 60, 60), (230, 230, 230)
 
@@ -179,7 +178,7 @@ def calibration_picture(balls: tuple[BallCalibration, ...]) -> Picture:
     The green circle is the outline and the red one the highlight. The red line from the centre to the highlight points
     towards the lamp. The caption has the number of the image, from 1, and the light direction x, y, z.
     """
-    columns = min(_COLUMNS, max(len(ball.directions) for ball in balls))
+    columns = min(6, max(len(ball.directions) for ball in balls))
     rows = []
     for ball in balls:
         tiles = [_tile(ball, number) for number in range(len(ball.directions))]
@@ -221,8 +220,6 @@ def _tile(ball: BallCalibration, number: int) -> Picture:
 SCENE_TILE = 96  # pixels: large enough to recognise shapes and materials; sixty scenes fit on a screen or two
 LARGE_TILE, FEW_SCENES = 160, 12
 MOST_SCENES = 120
-_WIDTH = 1900
-_GAMMA = 2.2
 _LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
 
 
@@ -236,7 +233,7 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
     with np.errstate(all="ignore"):  # a damaged array may have NaN
         strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
     width = max(strip.shape[1] for strip in strips)
-    across = max(1, _WIDTH // width)
+    across = max(1, 1900 // width)
     padded = [np.pad(strip, ((2, 2), (2, width - strip.shape[1] + 6), (0, 0))) for strip in strips]
     padded += [np.zeros_like(padded[0])] * (-len(padded) % across)
     rows = [np.hstack(padded[start : start + across]) for start in range(0, len(padded), across)]
@@ -251,7 +248,7 @@ def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
             # The image under the closest light, scaled so that its 98th percentile is white.
             closest = int(np.argmax(pixels.light_directions @ np.array(light)))
             values = np.asarray(pixels.observations[:, closest], np.float32)
-            exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / _GAMMA)
+            exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / 2.2)
             gray = np.rint(exposed[:, None] * 255).repeat(3, axis=1)
             tiles.append(_fit(_on_mask(gray, pixels.mask).astype(np.uint8), tile))
     return np.hstack(tiles)

@@ -95,7 +95,6 @@ def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
 
 
 _MAP_INCHES = 1.7
-_DPI = 150
 _EMPTY = "0.85"  # light gray, which the colour scale does not contain
 _SMALL, _LARGE = 8, 9  # points
 
@@ -146,7 +145,7 @@ def observation_map_figure(
     bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
     bar.set_label("relative to the largest observation", fontsize=_SMALL)
     bar.ax.tick_params(labelsize=_SMALL)
-    return png_bytes(figure, _DPI)
+    return png_bytes(figure, 150)
 
 
 def _finish(axes: Axes, size: int, grid: Grid) -> None:
@@ -220,7 +219,6 @@ _LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
 _TEXT_WIDTH = 0.62  # of its height: the average width of a character
 _MAPS_DPI = 100
 _POINT = _MAPS_DPI / 72  # pixels
-_WHITE = 255
 
 
 def method_maps(
@@ -323,5 +321,5 @@ def _resize(picture: Picture, scale: float) -> Picture:
 def _colour_normals(normals: Floats, known: Bools) -> Picture:
     """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if NaN is there."""
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
-    colours[~known] = _WHITE
+    colours[~known] = 255
     return colours

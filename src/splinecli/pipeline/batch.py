@@ -18,8 +18,8 @@ from typing import Any, Literal, NamedTuple
 
 from splinecli import __version__
 from splinecli.capture import capture_name
+from splinecli.capture.files import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.result_names import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
 from splinecli.pipeline.distribution import SAME_STORAGE, ClusterOptions, Item, LostError, distributor, this_worker

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.files import digest
+from splinecli.capture.files import FOUND_LIGHTS, FOUND_MASK, PAGE, digest
 from splinecli.capture.formats.images import check_memory
-from splinecli.capture.result_names import FOUND_MASK, LIGHT_FILES, PAGE
 from splinecli.capture.source import BYTES_OF_RESULTS
 from splinecli.capture_warnings import NOT_DISTILLED, PROBABLY_WRONG, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
@@ -276,7 +275,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 def _check_light_files(target: Path) -> None:
     """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
     own = files.own_light_files(target)
-    for name in LIGHT_FILES:
+    for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
             raise OutputError(
                 "the file is not from an earlier run, and --lights estimate would overwrite it",

@@ -12,14 +12,13 @@ from typing import Any, get_args
 import numpy as np
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.files import check_not_empty, list_images
+from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS, check_not_empty, list_images
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.light_rows import LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
 from splinecli.capture.record import ESTIMATE, LightFinder, azimuth_of, check_light_indices
-from splinecli.capture.result_names import MAPS, NORMALS, SCALED_MAPS
 from splinecli.capture.source import capture_bytes
 from splinecli.errors import SplinecliError, UsageError, check_one_of
 from splinecli.evaluation.protocol import check_draw_settings
@@ -195,7 +194,7 @@ class InferOptions(Reading):
     Args:
         n_lights: None for all. light_indices: counted from 0.
         distil: False for the method on every pixel, None for distillation of large captures only.
-        formats, maps: names of `splinecli.capture.result_names.NORMALS` and MAPS.
+        formats, maps: names of `splinecli.capture.files.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
     """
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import read_image, read_normal_map
+from splinecli.capture.files import ALBEDO_PICTURE, NORMALS, REPORT
 from splinecli.capture.formats.images import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import read_camera_matrix
-from splinecli.capture.result_names import ALBEDO_PICTURE, NORMALS, REPORT
 from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.results.files import UnfinishedError, read_report

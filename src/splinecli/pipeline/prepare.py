@@ -6,7 +6,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.result_names import CONTACT_SHEET
+from splinecli.capture.files import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
 from splinecli.pictures.maps import contact_sheet, encode_png
 from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor

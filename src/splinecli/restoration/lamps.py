@@ -49,7 +49,6 @@ is 1.6 % on Ball and 2.9 % on Cat; of six intensities, it is 4 and 7 %. Equal in
 
 _MAX_ROUNDS, _FITS_PER_ROUND = 200, 5
 _MAX_OBSERVATIONS, _MIN_PIXELS, _MAX_PIXELS = 100_000, 100, 2000
-_MIN_PIXELS_PER_LIGHT = 10
 _DARK_SHARE = 0.1  # of the brightest hundredth of the pixels
 _LIT_SHARE = 0.3  # of a pixel's brightest prediction; darker observations may be shadows
 _TILT_FITS, _LOWEST_COSINE, _LEAST_VARIANCE = 5, 0.05, 1e-4
@@ -106,7 +105,7 @@ def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None
         scaled_normals = _fit(values, known, intensities, lights)
         predicted = shade(scaled_normals, lights)
         counts = known & (predicted > _LIT_SHARE * predicted.max(axis=1, keepdims=True))
-        if (counts.sum(axis=0) < _MIN_PIXELS_PER_LIGHT).any():
+        if (counts.sum(axis=0) < 10).any():
             return None
         ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
         medians: Doubles = np.nanmedian(ratios, axis=0)
@@ -205,7 +204,6 @@ UNKNOWN_ERROR_DEG = 15.0  # of striped objects under lamps of pure colours, whos
 
 _DARK_COLOUR_SHARE = 0.15  # of the brightest hundredth of the sample, in every image
 _MIN_COLOUR_PIXELS = 50
-_LEAST_SHARE = 1e-3
 
 
 def lamp_colours(colours: Floats) -> tuple[Doubles | None, list[CaptureWarning]]:
@@ -221,7 +219,7 @@ def lamp_colours(colours: Floats) -> tuple[Doubles | None, list[CaptureWarning]]
     if np.count_nonzero(lit) < _MIN_COLOUR_PIXELS:
         return None, []
     shares = colours[:, lit] / np.maximum(sums[:, lit, None], 1e-9)
-    logs = np.log(np.maximum(shares, _LEAST_SHARE))
+    logs = np.log(np.maximum(shares, 1e-3))
     logs -= logs.mean(axis=2, keepdims=True)
     changes = logs - np.median(logs, axis=0)
     common = np.median(changes, axis=1)

@@ -16,10 +16,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.capture import Capture, CaptureSource
-from splinecli.capture.light_files import rows_text
-from splinecli.capture.linearise import StoredPixels, take_pixels
-from splinecli.capture.record import name_reading
-from splinecli.capture.result_names import (
+from splinecli.capture.files import (
     ALBEDO,
     ALBEDO_EXR,
     ALBEDO_PICTURE,
@@ -29,12 +26,12 @@ from splinecli.capture.result_names import (
     CURVATURE_PICTURE,
     CURVATURE_TIFF,
     ERROR_MAP,
+    FOUND_DIRECTIONS,
+    FOUND_INTENSITIES,
+    FOUND_LIGHTS,
     FOUND_MASK,
     GRADIENT,
     GRADIENT_TIFF,
-    LIGHT_DIRECTIONS,
-    LIGHT_FILES,
-    LIGHT_INTENSITIES,
     LIGHT_PLOT,
     NORMALS,
     OWN_FILES,
@@ -44,6 +41,9 @@ from splinecli.capture.result_names import (
     RELIEF_TIFF,
     REPORT,
 )
+from splinecli.capture.light_files import rows_text
+from splinecli.capture.linearise import StoredPixels, take_pixels
+from splinecli.capture.record import name_reading
 from splinecli.maths.normals import Convention, curvature_of_normals, describe, encode_picture, gradient_of_normals
 from splinecli.pictures.maps import (
     albedo_picture,
@@ -213,7 +213,7 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
-    The files, of OWN_FILES and LIGHT_FILES, replace those of an earlier run in the folder (see new_files), which the
+    The files, of OWN_FILES and FOUND_LIGHTS, replace those of an earlier run in the folder (see new_files), which the
     caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
@@ -234,9 +234,9 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return those of LIGHT_FILES in a folder of results that an earlier run wrote, as its report says."""
+    """Return those of FOUND_LIGHTS in a folder of results that an earlier run wrote, as its report says."""
     try:
-        return [name for name in LIGHT_FILES if name in read_report(folder)["files"]]
+        return [name for name in FOUND_LIGHTS if name in read_report(folder)["files"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
 
@@ -301,9 +301,9 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
     """Yield lights that were found from the images, as `--lights` and `--intensities` read them, and their plot."""
-    yield LIGHT_DIRECTIONS, rows_text(capture.light_directions)
+    yield FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if capture.estimated_intensities is not None:
-        yield LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
+        yield FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
     yield LIGHT_PLOT, plot
 
 

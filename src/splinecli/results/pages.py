@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli import __version__
+from splinecli.capture.files import NORMALS, PAGE, REPORT
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.images import decode_image, image_bytes
-from splinecli.capture.result_names import NORMALS, PAGE, REPORT
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
 from splinecli.pictures.maps import (

@@ -208,7 +208,6 @@ _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8",
 _COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
-_MOST_ELEMENTS = 10_000
 _MOST_NUMBERS = 1 << 20  # of a matrix of a small file
 
 
@@ -271,7 +270,7 @@ def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
         hint = "Save it with MATLAB's option -v7"
         raise InputError("found a MATLAB 7.3 file, which is not supported", path=path, hint=hint)
     order = "<" if header[126:] == b"IM" else ">"
-    for _ in range(_MOST_ELEMENTS):
+    for _ in range(10_000):
         if len(tag := file.read(_TAG_BYTES)) < _TAG_BYTES:
             return
         kind, length = struct.unpack(order + "II", tag)
