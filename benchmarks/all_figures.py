@@ -123,8 +123,9 @@ class Bench:
 
     def estimates(self, folder: Path, method: str, *, trials: int) -> Iterator[NormalEstimate]:
         """Yield the estimates of a capture under draws of ten lights."""
+        from splinecli.evaluation.protocol import draw_lights
+
         from splinecli.capture import open_capture
-        from splinecli.capture.lights.draws import draw_lights
         from splinecli.inference import estimate_normals
         from splinecli.methods import make_estimator
 
@@ -184,7 +185,7 @@ class Bench:
 
     def calibration(self) -> dict[str, Cells]:
         from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
-        from splinecli.capture.lights.light_files import read_light_directions
+        from splinecli.capture.light_files import read_light_directions
         from splinecli.maths.normals import angle_between_deg
 
         probes = [self.data / f"psbox/LightProbe-{number}" for number in (1, 2)]

@@ -21,12 +21,12 @@ from scipy.optimize import minimize
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
 from splinecli.capture import Capture, open_capture
-from splinecli.capture.lights.draws import draw_lights
-from splinecli.capture.restore.light_intensities import estimate_light_intensities
-from splinecli.capture.sample import Sample
 from splinecli.diagnosis.checks import check_arrays, check_capture
 from splinecli.diagnosis.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
+from splinecli.diagnosis.summary import Sample
+from splinecli.evaluation.protocol import draw_lights
 from splinecli.maths.transfer import encode_srgb
+from splinecli.restoration.lamps import estimate_light_intensities
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from point_lights import render_point_lights
 from splinecli.capture import Capture
-from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.record import in_one_plane
 from splinecli.inference import estimate_normals
-from splinecli.light.lamp_light import LightOf
+from splinecli.lights.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.confidence import capture_features
-from splinecli.light.indirect_light import PixelPlaces
-from splinecli.light.lamp_light import LampLight, Rows
+from splinecli.lights.indirect_light import PixelPlaces
+from splinecli.lights.lamp_light import LampLight, Rows
 from splinecli.methods.estimator import CONFIDENT_DEG
-from splinecli.networks.error_head import CaptureHead, error_negative_log_likelihood, probability_within
+from splinecli.networks.li_ne_net import CaptureHead, error_negative_log_likelihood, probability_within
 from splinecli.networks.weights import HEAD_FORMAT, SHIPPED, manifest, serialise, tensors_sha256
 from splinecli.system.files import file_sha256
 

@@ -59,7 +59,6 @@ SIZES = {
 def machine() -> Row:
     """Return versions and hardware."""
     import torch
-
     from splinecli.system.devices import choose_precision
 
     installed = {each.name: each.version for each in metadata.distributions()}
@@ -136,8 +135,8 @@ def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, sa
     always photographed with the processor's.
     """
     import torch
-
     from splinecli.system.devices import choose_device
+
     from splinecli.training import tasks
     from splinecli.training.config_files import configure
     from splinecli.training.loop import Trainer

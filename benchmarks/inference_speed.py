@@ -17,12 +17,12 @@ from collections.abc import Sequence
 
 import torch
 
-from splinecli.methods.networks import NetworkEstimator, Precision
+from splinecli.methods.batched import NetworkEstimator, Precision
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork, resolve_weights
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
-from splinecli.system.devices import choose_precision
+from splinecli.system.machine import choose_precision
 
 
 def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, repeats: int) -> float:

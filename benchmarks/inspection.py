@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
 from splinecli import estimate_normals
-from splinecli.maths.derivatives import curvature_of_normals
-from splinecli.pictures.maps import signed_picture
-from splinecli.pictures.png import encode_png
+from splinecli.maths.normals import curvature_of_normals
+from splinecli.pictures.maps import encode_png, signed_picture
 from splinecli.surface.integration import relief_of_normals
 
 Floats = NDArray[np.float64]

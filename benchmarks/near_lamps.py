@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from point_lights import render_point_lights
 from splinecli.capture import Capture
-from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.near_lamps import NearLamps
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import make_estimator
 from splinecli.surface.integration import integrate_normals

@@ -11,8 +11,7 @@ from typing import Any
 import typer
 
 from splinecli import __version__
-from splinecli.cli.commands import help_panels
-from splinecli.cli.main import app
+from splinecli.cli.main import app, help_panels
 
 EXIT_STATUS = {
     "0": "Done.",

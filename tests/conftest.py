@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from browser import browser, open_page
 from scenes import cap_directions, directions_at, shade, spiral_lights
-from splinecli.results.report import STAGES
+from splinecli.system.progress import STAGES
 
 __all__ = ["browser", "directions_at", "open_page"]
 

@@ -11,7 +11,7 @@ import pytest
 import typer
 
 import figure_tables
-from splinecli.capture import capture_warnings
+from splinecli import capture_warnings
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 

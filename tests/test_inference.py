@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.inference import estimate_normals
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 

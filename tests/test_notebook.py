@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import splinecli
-from splinecli.capture.arrays import capture_from_arrays
+from splinecli.capture.reader import capture_from_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-    from splinecli.capture.lights.found_lights import LightFinder
+    from splinecli.capture.record import LightFinder
     from splinecli.inference import NormalEstimate
 
 __version__ = "0.3.0"
@@ -103,19 +103,19 @@ def estimate_normals(
 
     import numpy as np
 
-    from splinecli.capture.arrays import capture_from_arrays
-    from splinecli.capture.capture_warnings import PROBABLY_WRONG
+    from splinecli.capture.reader import capture_from_arrays
+    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
     from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator
-    from splinecli.pipeline.estimate import estimate_capture
+    from splinecli.pipeline.infer import estimate_capture
 
     check_method(method)
     find: LightFinder | None = None
     if first_light is not None and light_directions is not None:
         raise UsageError("first_light is for lights that are found", hint="Leave it or light_directions out")
     if light_directions is None:
-        from splinecli.light.unknown_lights import find_lights
+        from splinecli.lights.unknown_lights import find_lights
 
         find = partial(find_lights, first_light=None if first_light is None else str(first_light))
     capture = capture_from_arrays(

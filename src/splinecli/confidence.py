@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
-from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
-from splinecli.diagnosis.frame_evidence import smooth_normals
-from splinecli.light.indirect_light import PixelPlaces
-from splinecli.light.lamp_light import LightOf, Rows, parts_of_rows
+from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
+from splinecli.lights.indirect_light import PixelPlaces
+from splinecli.lights.lamp_light import LightOf, Rows, parts_of_rows
+from splinecli.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
+from splinecli.lights.rough_normals import smooth_normals
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
-from splinecli.surface.blocks import Blocks
-from splinecli.system.side_by_side import side_by_side
+from splinecli.surface.pixel_grid import Blocks
+from splinecli.system.machine import side_by_side
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -33,7 +33,6 @@ FEWEST_PIXELS = 50
 _SAMPLE = 1500  # pixels
 _FACTOR_SAMPLE = 1000
 _BLOCKS = 2500  # over which normals are averaged for their curl
-_BRIGHT_QUANTILE = 0.95
 _DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
 _FITS = 4
 _DECODING = 2.2  # an exponent close to the curve of sRGB
@@ -52,7 +51,7 @@ def correct_errors(
 
     Args:
         light_of: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
     """
     import torch
 
@@ -158,7 +157,7 @@ def capture_features(
     Args:
         mask: (H, W), with P true pixels.
         light_of: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
         lights: (F, 3), unit; of near lamps, at the origin.
     """
     n_lights = len(lights)
@@ -167,7 +166,7 @@ def capture_features(
     rows = np.arange(0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
     light = light_of(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
-    bright = float(np.quantile(brightness, _BRIGHT_QUANTILE))
+    bright = float(np.quantile(brightness, 0.95))
     kept = brightness > _DARK_SHARE * bright
     if np.count_nonzero(kept) < FEWEST_PIXELS:
         return None

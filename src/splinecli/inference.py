@@ -1,4 +1,9 @@
-"""From a Capture and an Estimator to a NormalEstimate.
+"""From a Capture and an Estimator to a NormalEstimate, and the surface from which near lamps light each pixel.
+
+The surface that decides from where, and how strongly, each near lamp lights each pixel. Fit normals, integrate them,
+move the pixels onto the surface, and fit again with the light directions and the inverse-square falloff that the lamps
+have there. The surface begins as the object's mean plane. (Logothetis et al., "A CNN based approach for the point-light
+photometric stereo problem", arXiv 2210.04655, alternate alike.)
 
 Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
@@ -9,7 +14,7 @@ capture.
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,15 +24,47 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
-from splinecli.light.indirect_light import IndirectLight, PixelPlaces, find_indirect_light
-from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
-from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
-from splinecli.methods import Estimator
+from splinecli.lights.indirect_light import IndirectLight, PixelPlaces, find_indirect_light
+from splinecli.lights.lamp_light import LampLight, LightOf, Rows, flat_depth, parts_of_rows, surface_points
+from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
+from splinecli.methods import Estimator, make_estimator
 from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
-from splinecli.methods.near_light import find_surface
-from splinecli.surface.camera import rays_at
-from splinecli.system.memory import return_freed_memory
+from splinecli.surface.integration import integrate_normals
+from splinecli.surface.pixel_grid import Blocks, rays_at
+from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
+
+ROUNDS = 2
+"""Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
+
+METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
+
+PIXELS_ON_THE_WAY = 40_000
+"""Larger captures are fitted on the way at about this size: fine detail hardly moves the surface."""
+
+
+def find_surface(capture: Capture) -> Capture:
+    """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is."""
+    lamps = capture.lamps
+    if lamps is None or lamps.points is not None:
+        return capture
+    estimator = make_estimator(METHOD)
+    blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
+    observations = blocks.average(capture.observations, capture.mask)
+    depth = np.full(blocks.mask.shape, flat_depth(lamps))
+    for _ in range(ROUNDS):
+        points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
+        light = LampLight.of(observations, replace(lamps, points=points))
+        normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
+        normal_map = np.zeros((*blocks.mask.shape, 3))
+        normal_map[blocks.mask] = normals
+        depth = integrate_normals(normal_map, blocks.mask, blocks.shrink_camera(lamps.camera_matrix))
+        if lamps.camera_matrix is None:
+            depth *= blocks.step  # from blocks to pixels
+    rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
+    points = surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
+    return replace(capture, lamps=replace(lamps, points=points))
+
 
 Stage = Callable[[str], AbstractContextManager[Progress]]
 

@@ -13,7 +13,7 @@ from splinecli.calibration.circle import Circle
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
-from splinecli.pictures.calibration import calibration_picture
+from splinecli.pictures.maps import calibration_picture
 
 BALL = Circle(103.3, 88.7, 61.4)
 

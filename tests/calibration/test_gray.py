@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scenes import write_capture
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.gray import Target, measure_light_intensities
+from splinecli.calibration.lamps import Target, measure_light_intensities
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import InputError
 

@@ -9,12 +9,19 @@ from numpy.typing import NDArray
 
 from calibration.conftest import Render
 from scenes import directions_at, spiral_lights
-from splinecli.calibration.balls import BallCalibration, BallFiles, calibrate_ball, combine_balls, find_ball_files
+from splinecli.calibration.balls import (
+    DISTANT,
+    SHORTEST_LENS,
+    BallCalibration,
+    BallFiles,
+    Highlight,
+    View,
+    calibrate_ball,
+    combine_balls,
+    find_ball_files,
+)
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.lamp_positions import intersect_rays, triangulate_lamps
-from splinecli.calibration.mirror_ball import Highlight
-from splinecli.calibration.report import calibration_report, summary_lines
-from splinecli.calibration.view import DISTANT, SHORTEST_LENS, View
+from splinecli.calibration.lamps import calibration_report, intersect_rays, summary_lines, triangulate_lamps
 from splinecli.maths.normals import unit
 
 SHAPE = 160, 400

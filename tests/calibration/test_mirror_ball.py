@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.conftest import Render
+from splinecli.calibration.balls import ball_centre, check_in_front, find_highlight, reflect
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.mirror_ball import ball_centre, check_in_front, find_highlight, reflect
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
 

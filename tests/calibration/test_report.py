@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.calibration.balls import BallCalibration, BallFiles, combine_balls
+from splinecli.calibration.balls import BallCalibration, BallFiles, Highlight, View, combine_balls
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.mirror_ball import Highlight
-from splinecli.calibration.report import calibration_report, summary_lines
-from splinecli.calibration.view import View
+from splinecli.calibration.lamps import calibration_report, summary_lines
 from splinecli.maths.normals import unit
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splinecli.calibration.view import DISTANT, find_view
+from splinecli.calibration.balls import DISTANT, find_view
 from splinecli.capture.formats.facts import read_facts
 
 

@@ -35,7 +35,7 @@ def test_messages_of_the_command_are_not_caught_with_those_of_the_libraries() ->
     script = """
 import os, sys
 from contextlib import redirect_stderr
-from splinecli.capture.formats.damage import native_stderr, stderr_is_apart
+from splinecli.capture.formats.decoders import native_stderr, stderr_is_apart
 from splinecli.cli.main import _apart
 assert not stderr_is_apart()
 with redirect_stderr(_apart(sys.stderr)):

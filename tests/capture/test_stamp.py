@@ -9,7 +9,7 @@ import pytest
 from capture.conftest import WriteImage
 from scenes import write_capture
 from splinecli.capture import RadiometricCalibration, open_capture
-from splinecli.capture.stamp import digest
+from splinecli.capture.files import digest
 
 OTHERS = ("light_directions.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png")
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from splinecli.capture import open_capture
-from splinecli.capture.window import Window, parse_window
+from splinecli.capture.linearise import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.inference import light_on
-from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
+from splinecli.lights.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import describe_capture
-from splinecli.surface.camera import pixel_rays
+from splinecli.surface.pixel_grid import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]

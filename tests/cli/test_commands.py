@@ -11,9 +11,8 @@ import pytest
 import typer
 
 from cli.test_schema import check
-from splinecli.cli.commands import OTHERS, sort_into_panels
-from splinecli.cli.failures import explain
-from splinecli.cli.main import app
+from splinecli.cli.console import explain
+from splinecli.cli.main import OTHERS, app, sort_into_panels
 
 COMMANDS = typer.main.get_command(app).commands
 

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 
-from splinecli.capture.layouts.result_names import MAPS, NORMALS
+from splinecli.capture.files import MAPS, NORMALS
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
 from splinecli.surface.surface_files import SURFACE_FILES

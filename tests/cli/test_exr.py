@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from splinecli.system.exr import encode_exr
+from splinecli.surface.surface_files import encode_exr
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -10,9 +10,9 @@ import pytest
 import typer
 
 from make_pages import EXAMPLES, FILES, man_pages
-from splinecli.capture.layouts.result_names import OWN_FILES
+from splinecli.capture.files import OWN_FILES
 from splinecli.cli.main import app
-from splinecli.results.index import INDEX
+from splinecli.results.pages import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -14,7 +14,7 @@ import pytest
 
 from splinecli.evaluation.trials import TrialStore
 from splinecli.system.publishing import UNDONE, NewFiles
-from test_publishing import LINKS
+from system.test_publishing import LINKS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
 
@@ -57,7 +57,7 @@ def alarm():
 def inputs(capture, monkeypatch):
     """What the commands read. Figures are not drawn: these tests are about their files."""
     drawn = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
-    monkeypatch.setattr("splinecli.evaluation.capture_figures.method_maps", lambda *_, **__: drawn)
+    monkeypatch.setattr("splinecli.evaluation.figures.method_maps", lambda *_, **__: drawn)
     np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
     Path("ball").mkdir()
     y, x = np.indices((100, 120))

@@ -16,18 +16,18 @@ import pytest
 import tifffile
 
 from cli.conftest import EXAMPLE, read_report
-from splinecli.capture.layouts.capture_files import IMAGE_SUFFIXES
-from splinecli.capture.layouts.result_names import (
+from splinecli.capture.files import (
     CONFIDENCE_PICTURE,
     ERROR_MAP,
     FOUND_MASK,
+    IMAGE_SUFFIXES,
     LIGHT_PLOT,
     MAPS,
     NORMALS,
     PLOTS,
 )
 from splinecli.maths.normals import angle_between_deg, decode_picture
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 from splinecli.surface.surface_files import SURFACE_FILES
 
 

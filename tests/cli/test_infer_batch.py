@@ -14,18 +14,19 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.layouts.test_cyclesps import write_object
+from capture.test_cyclesps import write_object
 from cli.conftest import read_report
 from splinecli.capture import source
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.least_squares import LeastSquares
-from splinecli.pipeline import estimate, infer
+from splinecli.methods.estimator import LeastSquares
+from splinecli.pipeline import infer
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import Observer
-from splinecli.results import files, report
+from splinecli.results import files
+from splinecli.system import progress
 from splinecli.system.files import NoRoomError
+from splinecli.system.progress import Observer
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
@@ -137,7 +138,7 @@ def test_arguments_are_checked_before_the_first_capture(
 ):
     make_capture("second")
     touched = []
-    monkeypatch.setattr("splinecli.pipeline.member.infer_capture", lambda *_, **__: touched.append(1))
+    monkeypatch.setattr("splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1))
     call = ("infer", capture, "second", "--method", "ls", *arguments)
     result = run(*call)
     assert (result.code, result.out, touched) == (code, "", [])
@@ -213,11 +214,11 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
 
         return call
 
-    monkeypatch.setattr(report.time, "perf_counter", lambda: now)
-    expected = dict.fromkeys((*report.STAGES, "total"), 0)
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now)
+    expected = dict.fromkeys((*progress.STAGES, "total"), 0)
     for place, (stage, module, name) in enumerate((
-        ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", estimate, "distil_for"),
-        ("estimate", estimate, "estimate_normals"), ("pictures", infer, "albedo_map"),
+        ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", infer, "distil_for"),
+        ("estimate", infer, "estimate_normals"), ("pictures", infer, "albedo_map"),
         ("surface", infer, "make_surface"), ("write", files, "encode_normals"),
     )):  # fmt: skip
         monkeypatch.setattr(module, name, takes(10**place, getattr(module, name)))

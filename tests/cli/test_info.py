@@ -61,7 +61,7 @@ def test_the_camera_of_exif(run, tmp_path):
 def test_a_part_of_the_pixels_gives_the_same_report(run, capture, monkeypatch):
     """As of large images."""
     whole = json.loads(run("info", capture, "--json").out)
-    monkeypatch.setattr("splinecli.capture.summary._ENOUGH", 400)
+    monkeypatch.setattr("splinecli.diagnosis.summary._ENOUGH", 400)
     sampled = json.loads(run("info", capture, "--json").out)
     assert sampled["exposure"].pop("bright") == pytest.approx(whole["exposure"].pop("bright"), rel=0.02)
     assert sampled == whole

@@ -10,9 +10,9 @@ import tifffile
 from PIL import Image
 
 from scenes import BUMP_LAMPS, write_bump
-from splinecli.capture.formats import image_size
-from splinecli.capture.formats.image_size import results_bytes
+from splinecli.capture.formats import images
 from splinecli.maths.normals import encode_picture
+from splinecli.pipeline.infer import results_bytes
 
 SHAPE = (40, 50)
 
@@ -295,9 +295,9 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
     n_pixels = json.loads(Path("out/sphere/report.json").read_text())["n_pixels"]
     assert results_bytes(n_pixels, 5, surface=True) - results_bytes(n_pixels, 5) == n_pixels * 600
-    monkeypatch.setattr(image_size, "available_memory", lambda: n_pixels * 600.0)
+    monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0)
     assert run("integrate", "out/sphere").code == 0
-    monkeypatch.setattr(image_size, "available_memory", lambda: n_pixels * 600.0 - 1)
+    monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0 - 1)
     refused = run("integrate", "out/sphere", "--overwrite")
     assert (refused.code, f"the surface of {n_pixels} pixels takes" in refused.err) == (3, True)
 

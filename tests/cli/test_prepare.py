@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.layouts.test_cyclesps import normals, write_object
+from capture.test_cyclesps import normals, write_object
 from kills import content
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from splinecli.capture import capture_warnings
+from splinecli import capture_warnings
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
 

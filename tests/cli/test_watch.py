@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from splinecli.cli import watch
+from splinecli.cli import infer as watch
 
 
 def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_capture, monkeypatch) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenes import shade, sphere, spiral_lights
-from splinecli.capture.sample import sample_observations
-from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.diagnosis.odd_images import check_ground_truth
+from splinecli.diagnosis.summary import sample_observations
 
 LIGHTS = spiral_lights(10, 55, 12)
 

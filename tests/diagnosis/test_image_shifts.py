@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from scenes import ring_lights
-from splinecli.capture.sample import Sample
-from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
+from splinecli.diagnosis.odd_images import ImageShift, find_shifts
+from splinecli.diagnosis.summary import Sample
 
 SIDE, N_LIGHTS = 90, 10
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 import scenes
 from scenes import ring_lights, spiral_lights
 from splinecli.capture import read_capture
-from splinecli.capture.lights.light_fit import find_factors, random_misfits
-from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, parse_light_frame
+from splinecli.capture.light_rows import PLANE_FRAMES, LightFrame, parse_light_frame
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.diagnosis.light_order import UNKNOWN_ORDER
 from splinecli.errors import UsageError
+from splinecli.lights.light_fit import find_factors, random_misfits
 from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 import scenes
 from scenes import spiral_lights
 from splinecli.capture import read_capture
-from splinecli.capture.lights.light_fit import find_factors
-from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.light_rows import parse_light_frame
 from splinecli.diagnosis.light_check import check_lights
-from splinecli.diagnosis.odd_image import OddImage, find_odd_image
+from splinecli.diagnosis.odd_images import OddImage, find_odd_image
+from splinecli.lights.light_fit import find_factors
 from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]

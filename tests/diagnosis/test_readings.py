@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scenes import ring_lights, shade, spiral_lights, square_grid
 from scenes import sphere as ball
 from splinecli.capture import Capture
-from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.diagnosis.checks import check_arrays
 from splinecli.maths.normals import angle_between_deg, unit
 

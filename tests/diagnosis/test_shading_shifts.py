@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenes import shade, sphere, spiral_lights, square_grid
-from splinecli.capture.sample import Sample
 from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
+from splinecli.diagnosis.summary import Sample
 
 SIDE, N_LIGHTS = 56, 12
 LIGHTS = spiral_lights(N_LIGHTS, 60, 15)

@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 
 import scenes
 from scenes import directions_at, halfway, ring_lights, spiral_lights, square_grid
+from splinecli import capture_warnings as codes
 from splinecli.capture import Capture
-from splinecli.capture import capture_warnings as codes
-from splinecli.diagnosis.cast_shadows import cast_shadows
 from splinecli.diagnosis.checks import check_arrays
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.diagnosis.light_order import HALF_VECTORS
+from splinecli.lights.rough_normals import cast_shadows
 from splinecli.maths.normals import angle_between_deg, unit
 
 Array = NDArray[np.float64]

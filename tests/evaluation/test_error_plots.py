@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import decode_rgb
-from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
+from splinecli.evaluation.figures import light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
-from splinecli.pictures.plotting import method_styles
+from splinecli.pictures.plots import method_styles
 
 METHODS = ("ls", "spline-net")
 

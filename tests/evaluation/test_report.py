@@ -11,8 +11,8 @@ import pytest
 
 from html_page import HtmlPage
 from splinecli import __version__
+from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
-from splinecli.evaluation.report import html_report
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()

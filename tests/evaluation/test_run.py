@@ -249,7 +249,7 @@ def test_noise_that_lays_lights_into_a_plane_is_drawn_again(write_dome, monkeypa
         sigmas.append(sigma_deg)
         return unit(lights * (1, 0, 1)) if len(sigmas) == 1 else lights
 
-    monkeypatch.setattr("splinecli.evaluation.trial_capture.tilt_lights", tilt)
+    monkeypatch.setattr("splinecli.evaluation.trials.tilt_lights", tilt)
     protocol = Protocol(3, trials=1, light_noise_deg=30.0)
     assert evaluate([write_dome()], [make_estimator("ls")], protocol).results[0].mae_deg < 0.02
     assert sigmas == [30, 30]

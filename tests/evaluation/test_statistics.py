@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
-from splinecli.evaluation.statistics import AVERAGE, compare, holm, trial_averages
+from splinecli.evaluation.tables import AVERAGE, compare, holm, trial_averages
 
 
 def evaluation_of(**maes_deg: dict[str, tuple[float, ...]]) -> Evaluation:

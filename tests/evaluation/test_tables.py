@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.evaluation.document import results_csv, results_document
+from splinecli.evaluation.document import html_report, results_csv, results_document
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
-from splinecli.evaluation.report import html_report
 from splinecli.evaluation.tables import best_cells, latex, markdown, table_rows
 
 TEN = Evaluation(

@@ -7,13 +7,12 @@ import pytest
 
 from scenes import evaluate, shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
-from splinecli.capture.lights.draws import draw_lights
-from splinecli.capture.restore.white_level import WhiteLevel
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Protocol, draw_lights
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
+from splinecli.restoration.images import WhiteLevel
 
 SIDE, N_LIGHTS, CLIPPED, LEVEL = 48, 9, 3, 6000
 LS = make_estimator("ls")

@@ -16,7 +16,7 @@ from kills import content
 from scenes import write_capture
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.publishing import held_folder

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from scenes import cap_directions, halfway
-from splinecli.fits.ia14 import fit, minimise_nonnegative, solve
+from splinecli.fits.ia14 import fit, minimise_nonnegative, solve_ia14
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 
@@ -68,7 +68,7 @@ def test_exact_where_the_inverse_is_such_a_polynomial() -> None:
     found = fit(torch.as_tensor(observations), torch.as_tensor(lights), prior_weight=1e-9)[0].numpy()
     assert angle_between_deg(found, truth).max() < 0.01
     # The prior draws towards Lambert's law, which costs little with many lights.
-    found = solve(torch.as_tensor(observations), torch.as_tensor(lights)).numpy()
+    found = solve_ia14(torch.as_tensor(observations), torch.as_tensor(lights)).numpy()
     assert angle_between_deg(found, truth).mean() < 0.3
 
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from scenes import cap_directions, ring_lights
-from splinecli.fits.lambertian import fit_lambertian
+from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.normals import angle_between_deg
 
 

@@ -6,8 +6,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from splinecli.fits import iw12, least_absolute, trimmed_least_squares
-from splinecli.fits.weighted_least_squares import RIDGE, weighted_least_squares
+from splinecli.fits.least_squares import (
+    RIDGE,
+    SMALLEST_VARIANCE,
+    solve_iw12,
+    solve_l1,
+    solve_trimmed,
+    weighted_least_squares,
+)
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 
@@ -46,7 +52,7 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
     rng = np.random.default_rng(2)
     observations = observations[:10] * rng.uniform(0.7, 1.3, (10, 12))
     observations /= observations.max(axis=1, keepdims=True)
-    found = iw12.solve(torch.tensor(observations), torch.tensor(lights), iterations=3000).numpy()
+    found = solve_iw12(torch.tensor(observations), torch.tensor(lights), iterations=3000).numpy()
     for pixel, b in zip(observations, found, strict=True):
         gamma = np.ones(12)
         for _ in range(3000):
@@ -54,7 +60,7 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
             posterior = np.linalg.inv(lights.T @ weighted + RIDGE * np.eye(3))
             solution = posterior @ weighted.T @ pixel
             gamma = (pixel - lights @ solution) ** 2 + np.einsum("fi,ij,fj->f", lights, posterior, lights)
-            gamma = gamma.clip(iw12.SMALLEST_VARIANCE)
+            gamma = gamma.clip(SMALLEST_VARIANCE)
         np.testing.assert_allclose(b, solution, rtol=1e-5)
 
 
@@ -63,7 +69,7 @@ def test_l1_is_the_linear_programme_s_optimum() -> None:
     lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
     observations = rng.uniform(size=(30, 10))
-    found = least_absolute.solve(torch.tensor(observations), torch.tensor(lights)).numpy()
+    found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
     excess = []
     for pixel, b in zip(observations, found, strict=True):
         # min sum(t), -t <= I - L b <= t
@@ -83,13 +89,13 @@ def test_trimmed_ends(count: int, dropped: int) -> None:
     lights = torch.tensor(rng.normal(size=(count, 3)))
     observations = torch.tensor(rng.permutation(np.linspace(0.1, 1, count))[None])
     order = observations[0].argsort()
-    before = trimmed_least_squares.solve(observations, lights)
+    before = solve_trimmed(observations, lights)
     outer = observations.clone()
     outer[0, order[:dropped]] = 0
     outer[0, order[count - dropped :]] = 9
-    assert torch.equal(trimmed_least_squares.solve(outer, lights), before)
+    assert torch.equal(solve_trimmed(outer, lights), before)
     outer[0, order[count - dropped - 1]] = 9
-    assert not torch.allclose(trimmed_least_squares.solve(outer, lights), before)
+    assert not torch.allclose(solve_trimmed(outer, lights), before)
 
 
 def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:

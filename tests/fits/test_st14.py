@@ -6,10 +6,10 @@ import torch
 from numpy.typing import NDArray
 
 from scenes import cap_directions, halfway
-from splinecli.fits.st14 import solve
+from splinecli.fits.st14 import solve_st14
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def estimate(observations: Array, lights: Array) -> Array:
 
 def solved(observations: Array, lights: Array) -> Array:
     scaled = observations / observations.max(axis=1, keepdims=True)
-    normals: Array = solve(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
+    normals: Array = solve_st14(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
     return normals
 
 

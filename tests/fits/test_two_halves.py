@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from scenes import directions_at, spiral_lights
-from splinecli.fits.two_halves import alternating_signs, compare_halves
+from splinecli.fits.least_squares import alternating_signs, compare_halves
 
 LIGHTS = torch.tensor(spiral_lights(10, 55))
 SIGNS = alternating_signs(LIGHTS)

@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
-from splinecli.light.lamp_light import LampLight, LightOf
+from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.distilled import DistilledEstimator, distil
-from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
-from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.student_size import StudentSize, student_sizes
+from splinecli.methods.estimator import (
+    UNKNOWN_ERROR,
+    LeastSquares,
+    StudentSize,
+    confidence,
+    refiner_of,
+    student_sizes,
+    tells_confidence,
+)
 from splinecli.networks.refine_net import RefineNet
 from splinecli.refinement.refiner import NetworkRefiner
 

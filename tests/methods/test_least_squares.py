@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import spiral_lights
-from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.estimator import LeastSquares
 
 
 @pytest.mark.parametrize("count", [3, 4, 10, 96])

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.light.lamp_light import LampLight, LightOf
+from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
+from splinecli.methods.batched import NetworkEstimator, rotations_of
 from splinecli.methods.estimator import for_capture
-from splinecli.methods.networks import NetworkEstimator, rotations_of
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from tiny_networks import random_network

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from splinecli.methods.pixel_sample import draw_sample
+from splinecli.methods.distilled import draw_sample
 
 
 def clusters() -> Tensor:

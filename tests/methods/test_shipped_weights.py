@@ -12,7 +12,7 @@ from scenes import directions_at, shade
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import CONFIDENT_DEG
-from splinecli.networks.error_head import probability_within
+from splinecli.networks.li_ne_net import probability_within
 from splinecli.networks.spline_net import to_pixel_frame
 from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig

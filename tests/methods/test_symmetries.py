@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.light.lamp_light import LampLight
+from splinecli.lights.lamp_light import LampLight
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import Estimator, MethodOptions, make_estimator, method_names
 from splinecli.methods.estimator import for_capture

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from distributions import generator as seeded
 from splinecli.errors import ModelError
-from splinecli.networks.capture_context import ContextLayer, brightness_level
 from splinecli.networks.config import NetworkConfig
+from splinecli.networks.set_branch import ContextLayer, brightness_level
 from splinecli.networks.spline_net import SplineNet
 from tiny_networks import TINY, random_network
 

@@ -16,10 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.networks.li_net import PaperLINet
-from splinecli.networks.ne_net import PaperNENet
-from splinecli.networks.official import import_official
+from splinecli.networks.li_ne_net import PaperLINet, PaperNENet
 from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import import_official
 
 SIDE = 32
 

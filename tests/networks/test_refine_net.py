@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from splinecli.fits.two_halves import alternating_signs
-from splinecli.networks.refine_channels import CHANNELS, channels, split_features, with_refined
-from splinecli.networks.refine_net import COARSEST, RefineNet
+from splinecli.fits.least_squares import alternating_signs
+from splinecli.networks.refine_net import CHANNELS, COARSEST, RefineNet, channels, split_features, with_refined
 from splinecli.refinement.features import Turn, refine_features, turn_features, turn_maps
 
 HEIGHT, WIDTH = 6, 9

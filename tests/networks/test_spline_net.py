@@ -8,10 +8,10 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from splinecli.fits.lambertian import fit_lambertian
+from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.error_head import error_negative_log_likelihood, probability_within
+from splinecli.networks.li_ne_net import error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from tiny_networks import TINY, random_network

@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.networks.config import NetworkConfig
+from splinecli.networks.config import STARTING_FITS, NetworkConfig, fit_normals
 from splinecli.networks.spline_net import Rotation, SplineNet
-from splinecli.networks.starting_fits import STARTING_FITS, fit_normals
 from tiny_networks import TINY
 
 NAMES = tuple(STARTING_FITS)

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splinecli.pictures.light_sky import sky_plot
-from splinecli.pictures.training_curves import training_figure
+from splinecli.pictures.plots import sky_plot, training_figure
 
 COLUMNS: dict[str, list[float | None]] = {
     "step": [50, 100, 125], "loss": [2.0, 1.0, 0.5], "symmetric": [None, 0.5, None], "asymmetric": [None] * 3,

@@ -10,10 +10,10 @@ from splinecli.pictures.maps import (
     TOP_DEG,
     albedo_picture,
     colour_errors,
+    encode_png,
     error_map_picture,
     preview_picture,
 )
-from splinecli.pictures.png import encode_png
 
 
 def test_white_is_the_brightest_hundredth_of_the_mask():

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scenes import decode_rgb
 from splinecli.maths.normals import unit
 from splinecli.pictures.maps import TOP_DEG, colour_errors
-from splinecli.pictures.method_maps import method_maps
+from splinecli.pictures.plots import method_maps
 
 
 def draw(

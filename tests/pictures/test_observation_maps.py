@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import decode_rgb
-from splinecli.pictures.observation_maps import observation_map_figure
+from splinecli.pictures.plots import observation_map_figure
 
 SIZE = 8
 YELLOW, VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import InputError
-from splinecli.pipeline.arrivals import Arrivals
+from splinecli.pipeline.incoming import Arrivals
 
 
 class Clock:

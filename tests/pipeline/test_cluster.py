@@ -18,15 +18,12 @@ from scenes import write_capture
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
-from splinecli.pipeline import batch, connection
+from splinecli.pipeline import batch
 from splinecli.pipeline import distribution as distribution_module
-from splinecli.pipeline.batch import infer_batch
-from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
-from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
+from splinecli.pipeline.batch import Member, choose_workers, expected_bytes, infer_batch, list_captures
+from splinecli.pipeline.distribution import ClusterOptions, Distributor, Item, LostError, Work, distributor
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.member import Member, list_captures
-from splinecli.pipeline.observer import SILENT
+from splinecli.system.progress import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
@@ -36,7 +33,7 @@ GB = 10**9
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Two worker processes of 4 GB. A worker that is killed is replaced."""
-    with connection._local_cluster(ClusterOptions(workers=2)) as cluster:
+    with distribution_module._local_cluster(ClusterOptions(workers=2)) as cluster:
         yield cluster
 
 
@@ -178,10 +175,10 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
 
 def test_the_cores_are_shared_out(monkeypatch, work):
     """Of seven cores, each of three workers gets two, whatever the user allows above that."""
-    monkeypatch.setattr(connection, "count_available_cores", lambda: 7)
+    monkeypatch.setattr(distribution_module, "count_available_cores", lambda: 7)
     monkeypatch.setenv("OMP_NUM_THREADS", "16")
     options = ClusterOptions(workers=3)
-    with connection.connected(options) as client:
+    with distribution_module.connected(options) as client:
         assert run(client, work(worker_tasks.threads), numbered(range(1))) == {0: "2"}
 
 
@@ -232,9 +229,9 @@ def test_a_folder_that_cannot_be_written_does_not_end_the_batch(cluster, tmp_pat
 )
 def test_no_scheduler(address, tmp_path, monkeypatch):
     Path("broken.json").write_text("{}")
-    monkeypatch.setattr(connection, "_CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr(distribution_module, "_CONNECT_SECONDS", 0.2)
     with pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"):
-        connection.connected(ClusterOptions(address=address)).__enter__()
+        distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
@@ -246,11 +243,11 @@ def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
 
 
 def test_a_server_that_is_no_scheduler(monkeypatch):
-    monkeypatch.setattr(connection, "_ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(distribution_module, "_ANSWER_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(UsageError, match="no Dask scheduler answers"):
-            connection.connected(ClusterOptions(address=address)).__enter__()
+            distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
@@ -288,7 +285,7 @@ def test_the_number_of_workers(tmp_path, monkeypatch):
     options = InferOptions(method="ls")
     assert 0 < expected_bytes(members[0], options) < 10**6
     assert expected_bytes(members[1], options) == 0
-    monkeypatch.setattr("splinecli.pipeline.capture_memory.count_available_cores", lambda: 4)
-    monkeypatch.setattr("splinecli.pipeline.capture_memory.available_memory", lambda: 1.7e9)
+    monkeypatch.setattr("splinecli.pipeline.batch.count_available_cores", lambda: 4)
+    monkeypatch.setattr("splinecli.pipeline.batch.available_memory", lambda: 1.7e9)
     assert choose_workers(members, options) == 3
     assert choose_workers(members[:2], options) == 2

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scenes import Teacher, cap_directions, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
-from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.student_size import StudentSize
-from splinecli.pipeline import estimate
-from splinecli.pipeline.estimate import AUTOMATIC_FROM, distil_for
+from splinecli.methods.estimator import LeastSquares, StudentSize
+from splinecli.pipeline import infer
+from splinecli.pipeline.infer import AUTOMATIC_FROM, distil_for
 
 LIGHTS = spiral_lights(6, 40)
 
@@ -48,7 +47,7 @@ def test_small_captures_and_exact_ones_are_not_distilled() -> None:
 
 
 def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
+    monkeypatch.setattr(infer, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
     teacher = Slow()
     found, warnings = distil_for(capture(3000), teacher, True)
     assert warnings == []
@@ -58,14 +57,14 @@ def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("seconds", [0.0, 0.02])
 def test_the_size_decides_about_large_captures_not_the_speed(monkeypatch, seconds):
     """The load of a machine must not change normals."""
-    monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
+    monkeypatch.setattr(infer, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
     found, warnings = distil_for(capture(AUTOMATIC_FROM), Slow(seconds=seconds), None)
     assert found is not None and warnings == []
 
 
 def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = StudentSize(500, 50, 16), StudentSize(900, 50, 16)
-    monkeypatch.setattr(estimate, "student_sizes", lambda _: sizes)
+    monkeypatch.setattr(infer, "student_sizes", lambda _: sizes)
     teacher = Slow(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None

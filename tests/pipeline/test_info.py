@@ -2,10 +2,10 @@
 
 from typing import get_args
 
-from splinecli.capture.restore.white_level import Origin
-from splinecli.pipeline.capture_memory import REFINED_PIXELS
+from splinecli.pipeline.infer_options import REFINED_PIXELS
 from splinecli.pipeline.info import ORIGINS
 from splinecli.refinement.refiner import MARGIN, TILE
+from splinecli.restoration.images import Origin
 
 
 def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:

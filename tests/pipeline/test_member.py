@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import UsageError
-from splinecli.pipeline.member import Shard, list_captures
+from splinecli.pipeline.batch import Shard, list_captures
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])

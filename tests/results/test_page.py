@@ -15,8 +15,8 @@ from scenes import decode_rgb
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
-from splinecli.results import page as page_module
-from splinecli.results.page import result_page
+from splinecli.results import pages as page_module
+from splinecli.results.pages import result_page
 
 HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
 LONGEST_SIDE = 1600  # of a reduced map

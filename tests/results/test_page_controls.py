@@ -7,8 +7,8 @@ import pytest
 
 from browser import OpenPage
 from html_page import REPORT, SIDE, ball, light_at
-from splinecli.results import page as page_module
-from splinecli.results.page import result_page
+from splinecli.results import pages as page_module
+from splinecli.results.pages import result_page
 
 
 def wait_until(page: Any, condition: str) -> None:

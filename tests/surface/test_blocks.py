@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splinecli.surface.blocks import Blocks
+from splinecli.surface.pixel_grid import Blocks
 
 RNG = np.random.default_rng(0)
 MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18

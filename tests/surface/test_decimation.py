@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from glb_file import read_glb
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.surface import decimation
-from splinecli.surface.decimation import decimated_mesh
-from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.surface import mesh as mesh_module
+from splinecli.surface.mesh import SurfaceMesh, decimated_mesh, surface_mesh
 from splinecli.surface.surface_files import Surface, encode_surface
 
 SIDE = 90
@@ -110,10 +109,10 @@ def test_vertices_stay_on_the_dome_and_in_their_places(decimated, camera):
 @pytest.mark.parametrize("odd", [0, 1])
 def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
     """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their places."""
-    monkeypatch.setattr(decimation, "LARGE_MAP", 0)
+    monkeypatch.setattr(mesh_module, "LARGE_MAP", 0)
     surface, normal_map = dome(camera, odd)
     mask = surface[1]
-    blocks = decimation._mesh_of_blocks(*surface, 300, normal_map, None)
+    blocks = mesh_module._mesh_of_blocks(*surface, 300, normal_map, None)
     assert blocks is not None and 4 * 300 <= len(blocks.triangles) < np.count_nonzero(mask)
     mesh = decimated_mesh(*surface, n_triangles=300, normal_map=normal_map)
     assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from splinecli.errors import ModelError, UsageError
-from splinecli.networks.refine_channels import CHANNELS
+from splinecli.networks.refine_net import CHANNELS
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights, resolve_weights, save_weights
 from splinecli.pixel_sets.store import Pixels, PixelSet

@@ -1,23 +1,189 @@
-"""Light directions from folders of images of mirror balls."""
+"""Light directions from folders of images of mirror balls: the camera, the highlights, and the balls together.
 
-from collections.abc import Sequence
+The highlight of a lamp in a mirror ball, and the light direction that follows from it. The ball's normal n at the
+highlight halves the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A
+common mistake is to use n itself as the light direction. The camera is at the origin, and the unit of length is the
+radius of the ball. x is right, y up, z towards the camera.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
-from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
-from splinecli.calibration.view import View, find_view, unit_rays
+from splinecli.capture.files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
 from splinecli.capture.formats.facts import ImageFacts, read_facts
-from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
-from splinecli.capture.layouts.capture_files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
+from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
+from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.capture.source import Progress
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles, Singles
+from splinecli.maths import Array, Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.surface.pixel_grid import ray_basis
+
+DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
+
+SHORTEST_LENS = 0.7
+"""Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
+
+EXIF_ERROR = 0.05
+"""Standard deviation of a focal length in EXIF, as a share: numbers are rounded, and focusing changes it."""
+
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
+_MILLIMETRES = {2: 25.4, 3: 10.0}
+_FILM_DIAGONAL = math.hypot(36, 24)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The camera of a calibration."""
+
+    matrix: Doubles  # (3, 3) in pixels
+    source: str  # "--camera-matrix", "EXIF" or "assumed distant"
+    shortest: float  # the focal length of the shortest usual lens, in pixels
+
+    @property
+    def known(self) -> bool:
+        return self.source != "assumed distant"
+
+    def draw(self, generator: np.random.Generator) -> Doubles:
+        """Return a matrix (3, 3) that may be the true one."""
+        factor = 1.0
+        if not self.known:
+            # All rays of sight from parallel to those of the shortest lens, evenly.
+            nearest = self.shortest / float(self.matrix[0, 0])
+            factor = nearest / generator.uniform(nearest, 1)
+        elif self.source == "EXIF":
+            factor = math.exp(EXIF_ERROR * generator.normal())
+        matrix = self.matrix.copy()
+        matrix[:2, :2] *= factor
+        return matrix
+
+
+def unit_rays(points: Doubles, matrix: Doubles) -> Doubles:
+    """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
+    return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
+
+
+def find_view(image: ImageFacts, matrix: Path | None) -> View:
+    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
+
+    Raises InputError where the file or the image cannot be read, or the file has no camera matrix.
+    """
+    height, width = image.size[0][:2]
+    shortest = SHORTEST_LENS * max(width, height)
+    if matrix is not None:
+        return View(read_camera_matrix(matrix), "--camera-matrix", shortest)
+    found = _focal_length(image.exif or {}, width, height)
+    focal = found or DISTANT
+    given = np.array(((focal, 0, (width - 1) / 2), (0, focal, (height - 1) / 2), (0, 0, 1.0)))
+    return View(given, "assumed distant" if found is None else "EXIF", shortest)
+
+
+def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
+    """Return the focal length in pixels from EXIF tags; None where they do not tell it."""
+    try:
+        if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
+            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
+            pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
+        else:
+            pixels = float(tags[_FILM]) / _FILM_DIAGONAL * math.hypot(width, height)
+    except Exception:  # damaged tags cause a dozen types of errors
+        return None
+    return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
+
+
+HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
+MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
+_MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed ball, not a lamp
+
+
+@dataclass(frozen=True)
+class Highlight:
+    """The image of a lamp in a mirror ball."""
+
+    x: float  # of the centroid, in pixels of the image
+    y: float
+    saturated: float  # share of its pixels that is saturated, 0 to 1
+
+
+def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
+    """Return the highlight of the lamp in the ball: the weighted centroid of its brightest patch.
+
+    Args:
+        image: (H, W), linear gray values.
+        full_scale: the value at which pixels saturate. None for images that do not saturate.
+
+    Raises:
+        InputError: the ball shows no highlight, or its brightest patch is too wide for a lamp.
+    """
+    inside = circle.inside(image.shape)
+    values = np.where(inside, image, 0).astype(np.float32)
+    # The blur removes bright single pixels, which are dust or noise.
+    smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
+    brightest, median = float(smooth.max()), float(np.median(values[inside]))
+    if brightest <= MIN_CONTRAST * median or brightest <= 0:
+        raise InputError(
+            "found no highlight in the ball",
+            hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
+            " lamp must be by far the brightest spot in the ball",
+        )
+    _, labels = cv2.connectedComponents((smooth >= HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
+    # Of several patches, take the one with the most light rather than the one with the brightest pixel.
+    light = np.bincount(labels.ravel(), weights=smooth.ravel())
+    light[0] = 0
+    core = labels == light.argmax()
+    y, x = np.nonzero(core)
+    width = max(np.ptp(x), np.ptp(y))
+    if width > _MAX_WIDTH * 2 * circle.radius:
+        problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
+        raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
+    # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
+    weight = smooth[core].astype(np.float64) - 0.9 * HIGHLIGHT_LEVEL * brightest
+    saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
+    return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
+
+
+def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
+    """Return the centre (3,) of a ball whose outline a camera sees at image points (N, 2).
+
+    Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
+    linear. Written with m_z + 1, it is also exact for a camera that is far away.
+    """
+    x, y, _ = (np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)).T
+    equations = np.column_stack((x, y, np.ones(len(x))))
+    right_side = (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1))
+    kept = np.ones(len(x), np.bool_)
+    for _ in range(4):
+        solution = np.linalg.lstsq(equations[kept], right_side[kept], rcond=None)[0]
+        misses = np.abs(equations @ solution - right_side)
+        kept = misses <= 4 * np.median(misses) + 1e-30
+    mx, my, beyond = solution
+    inverse = mx * mx + my * my + beyond * (2 + beyond)
+    return np.asarray(np.array((mx, my, -1 - beyond)) / np.sqrt(max(inverse, 1e-30)))
+
+
+def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doubles, Doubles]:
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
+    rays = unit_rays(highlights, matrix)
+    across = centre - (rays @ centre)[:, None] * rays
+    with np.errstate(invalid="ignore"):
+        normals = -across - np.sqrt(1 - np.square(across).sum(axis=1, keepdims=True)) * rays
+    return normals, rays - 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
+
+
+def check_in_front(direction: Doubles, ray: Doubles) -> None:
+    """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
+    if not direction @ ray < 0:
+        problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
+        raise InputError(problem, hint="Place all lights on the camera's side of the object")
+
 
 REFERENCES = ("ref", "reference")
 """Names, without suffix, of an image that shows the outline of the ball and belongs to no light."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Doubles, Singles
+from splinecli.maths import Array, Bools, Doubles, Singles
 from splinecli.maths.normals import unit
 
 RAYS = 720

@@ -1,16 +1,15 @@
 """Captures: images of one object under known lights, read from folders of files."""
 
-from splinecli.capture.arrays import capture_from_arrays
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.files import Overrides
 from splinecli.capture.formats.images import read_image, read_mask
 from splinecli.capture.formats.normal_files import read_normal_map
-from splinecli.capture.layouts.capture_files import Overrides
-from splinecli.capture.layouts.registry import capture_name, find_capture_files, find_captures
-from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.layouts import capture_name, find_capture_files, find_captures
+from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.linearise import RadiometricCalibration
-from splinecli.capture.reader import open_capture, read_capture
+from splinecli.capture.reader import capture_from_arrays, open_capture, read_capture
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource
+from splinecli.capture_warnings import CaptureWarning
 
 __all__ = [
     "Capture",

@@ -3,23 +3,110 @@ divide by the falloff and by the light's intensity. Files and arrays have the la
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli import capture_warnings as codes
 from splinecli.capture.formats.facts import ImageFacts
-from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import decode_image, to_linear
-from splinecli.capture.restore.lamp_colours import SAMPLE, lamp_colours
-from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
-from splinecli.capture.window import Window
-from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
+from splinecli.capture.formats.images import ExpectedSize, decode_image, to_linear
+from splinecli.capture_warnings import CaptureWarning
+from splinecli.errors import InputError, UsageError
+from splinecli.maths import Array, Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
+from splinecli.restoration.images import ImageValues, Saturation, look_at, white_level_warnings
+from splinecli.restoration.lamps import COLOUR_SAMPLE, lamp_colours
+
+Numbers = TypeVar("Numbers", bound=np.generic)
+
+_SCALE, _CROP = re.compile(r"1(?:/(\d{1,3}))?"), re.compile(r"\d{1,9}(?:,\d{1,9}){3}")
+
+
+@dataclass(frozen=True)
+class Window:
+    """Which pixels of the images are read. Pixels are left out, not averaged, so values are those of the files."""
+
+    box: tuple[int, int, int, int] | None = None  # left, top, width and height in pixels; None for whole images
+    step: int = 1  # one of so many rows and columns is read
+    shape: tuple[int, ...] | None = None  # (H, W) of the whole images, where they are not read as a whole
+
+    @property
+    def is_whole(self) -> bool:
+        return self.box is None and self.step == 1
+
+    def in_words(self) -> str | None:
+        """Return what is read, for people; None for whole images."""
+        words = []
+        if self.box is not None:
+            left, top, width, height = self.box
+            words.append(f"{width} x {height} pixels from ({left}, {top})")
+        if self.step > 1:
+            words.append(f"one of {self.step} rows and columns")
+        return ", ".join(words) or None
+
+    def of(self, pixels: NDArray[Numbers]) -> NDArray[Numbers]:
+        """Return the part of an image or map (H, W, ...) that is read, as a view."""
+        left, top, width, height = self.box or (0, 0, pixels.shape[1], pixels.shape[0])
+        return pixels[top : top + height : self.step, left : left + width : self.step]
+
+    def whole(self, mask: Bools) -> Bools:
+        """Return the mask of whole images from a mask of what is read."""
+        whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
+        self.of(whole)[...] = mask
+        return whole
+
+    def camera(self, matrix: Floats) -> Doubles:
+        """Return the camera matrix (3, 3) of what is read, from that of whole images."""
+        left, top, *_ = self.box or (0, 0)
+        to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
+        return np.asarray(to_window @ matrix, np.float64)
+
+    def filled(self, mask: Bools) -> Bools:
+        """Return the mask of whole images from a mask of what is read. A pixel stands for those left out beside it."""
+        whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
+        part = replace(self, step=1).of(whole)
+        part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
+        return whole
+
+    def on(self, image: ImageFacts) -> Window:
+        """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
+        if self.is_whole:
+            return self
+        height, width = shape = image.size[0][:2]
+        if self.box is not None:
+            left, top, box_width, box_height = self.box
+            if left + box_width > width or top + box_height > height:
+                crop = ",".join(map(str, self.box))
+                problem = f"--crop {crop} is not inside the image of {width} x {height} pixels"
+                raise InputError(problem, path=image.path)
+        return replace(self, shape=shape)
+
+
+WHOLE = Window()
+
+
+def parse_window(crop: str | None, scale: str | None) -> Window:
+    """Return the window of --crop X,Y,W,H and --scale 1/N. Raises UsageError."""
+    box: tuple[Any, ...] | None = None
+    if crop is not None:
+        found = _CROP.fullmatch(crop.replace(" ", ""))
+        box = tuple(int(number) for number in found[0].split(",")) if found else ()
+        if not box or not box[2] or not box[3]:
+            problem = f"--crop is {crop!r}; expected X,Y,W,H: the left upper corner and the size in pixels"
+            raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
+    step = 1
+    if scale is not None:
+        found = _SCALE.fullmatch(scale.replace(" ", ""))
+        step = int(found[1] or 1) if found else 0
+        if not step:
+            raise UsageError(f"--scale is {scale!r}; expected 1/N, such as 1/4")
+    return Window(box, step)
+
 
 BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
@@ -185,7 +272,7 @@ def collect_observations(
     """
     observations = np.empty((n_pixels, n_images), np.float32)
     any_8_bit, found, colours = False, list[ImageValues](), list[Singles]()
-    compared = np.linspace(0, n_pixels - 1, min(n_pixels, SAMPLE)).astype(np.intp)
+    compared = np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
         found.append(image.find_saturated(white_level))
@@ -194,7 +281,7 @@ def collect_observations(
             colours.append(replace(image, linear=image.linear[compared]).colours())
         del image  # before the next one is decoded
     saturation = Saturation(n_pixels, tuple(found), white_level)
-    warnings = codes.white_level(saturation.white_level)
+    warnings = white_level_warnings(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)
     if saturated > codes.SATURATED_SHARE:
         text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."

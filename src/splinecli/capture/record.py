@@ -1,19 +1,74 @@
-"""The record that all steps after reading work on: the mask's pixels under known lights."""
+"""The record that all steps after reading work on, the same with the values that files store, and lights that are
+found."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.restore.white_level import WhiteLevel
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Array, Bools, Doubles, Integers, Singles
-from splinecli.surface.camera import ray_basis
+from splinecli.maths import Array, Bools, Doubles, Integers, Singles
+from splinecli.restoration.images import Saturation, WhiteLevel, restore_saturated
+from splinecli.restoration.lamps import estimate_light_intensities
+from splinecli.surface.pixel_grid import ray_basis
+
+SIDES_DEG = {
+    "right": 0.0,
+    "upper-right": 45.0,
+    "above": 90.0,
+    "upper-left": 135.0,
+    "left": 180.0,
+    "lower-left": 225.0,
+    "below": 270.0,
+    "lower-right": 315.0,
+}
+"""Azimuths of the sides of an image: counter-clockwise from the right."""
+
+ESTIMATE = "estimate"  # given in place of a light file: the lights are found from the images
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLights:
+    """Lights of F images."""
+
+    directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
+    errors_deg: Doubles  # (F,), the expected errors of the directions in degrees
+    intensities: Doubles | None = None  # (F,), with a mean of 1; None where they are known
+
+
+def azimuth_of(first_light: str) -> float:
+    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number of degrees.
+
+    Raises UsageError for other text.
+    """
+    if first_light in SIDES_DEG:
+        return SIDES_DEG[first_light]
+    try:
+        azimuth = float(first_light)
+    except ValueError:
+        azimuth = np.nan
+    if not abs(azimuth) <= 360:
+        raise UsageError(
+            f"the first light comes from {first_light!r}; expected one of {', '.join(SIDES_DEG)}, or its azimuth in"
+            " degrees, counter-clockwise from the right"
+        )
+    return azimuth
+
+
+def placeholders(n_lights: int) -> Doubles:
+    """Return directions (F, 3) that mean nothing, in place of those that are found later: any that give normals."""
+    azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
+    return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
+
+
+LightFinder = Callable[[Singles, Bools, bool], FoundLights]
+"""Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""
+
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
@@ -217,3 +272,85 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
 def _blocks(rows: Singles) -> Iterator[Singles]:
     for start in range(0, len(rows), _BLOCK):
         yield rows[start : start + _BLOCK]
+
+
+def name_reading(*, as_stored: bool) -> str:
+    """Return how a capture was read, as reports and pixel sets name it; see CaptureSource.read."""
+    return "as stored" if as_stored else "restored"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredCapture:
+    """A capture as its files store it, with what is needed to restore it.
+
+    `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
+    lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
+    level of a choice is decided from its images alone.
+    """
+
+    capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
+    saturation: Saturation
+    intensities_known: bool  # whether a file, an option or the image format gives the light intensities
+    found_intensities: Doubles | None = None  # (F,), those that were found together with the directions, or None
+
+    def find_lights(self, find: LightFinder) -> StoredCapture:
+        """Return the capture under lights that are found from these observations.
+
+        Raises InputError where the images do not tell the lights, or those that are found cannot give normals.
+        """
+        capture = self.capture
+        try:
+            found = find(capture.observations, capture.mask, self.intensities_known)
+        except InputError as error:
+            raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
+        warnings, directions = (*capture.warnings, estimated_lights(found.errors_deg)), found.directions
+        capture = replace(capture, light_directions=directions, light_errors_deg=found.errors_deg, warnings=warnings)
+        return replace(self, capture=capture, found_intensities=found.intensities)
+
+    def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
+        """Return the capture under some of its lights, with arrays of its own, but the warnings of all lights."""
+        capture, saturation = self.capture.choose_lights(positions), self.saturation.choose_images(positions)
+        if saturation.white_level != capture.white_level:
+            capture = replace(capture, white_level=saturation.white_level)
+        found = None if self.found_intensities is None else self.found_intensities[list(positions)]
+        return replace(self, capture=capture, saturation=saturation, found_intensities=found)
+
+    def choose_pixels(self, rows: Integers) -> StoredCapture:
+        """Return the capture with these rising rows of its observations, with arrays of its own."""
+        return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
+
+    def estimate_intensities(self) -> Doubles | None:
+        """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
+        if self.intensities_known or self.found_intensities is not None:
+            return self.found_intensities
+        return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
+
+    def restore(self, intensities: Doubles | None) -> Capture:
+        """Return the capture with its intensities divided out and its saturated observations restored.
+
+        The observations are changed in place: this record must not be used afterwards.
+        """
+        observations, warnings, restored = self.capture.observations, self.capture.warnings, None
+        if intensities is not None:
+            observations /= intensities.astype(np.float32)
+            text = (
+                "The light intensities were estimated from the images: they are unequal, from"
+                f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you"
+                " have measured them, or --intensities equal to assume equal ones."
+            )
+            warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
+        saturated = self.saturation.flags
+        if saturated is not None:
+            restored = restore_saturated(observations, saturated, self._lights_of)
+        if intensities is None and restored is None:
+            return self.capture
+        return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)
+
+    def _lights_of(self, rows: Integers) -> Doubles:
+        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near lamps on a plane."""
+        lamps = self.capture.lamps
+        if lamps is None:
+            return self.capture.light_directions
+        places = np.flatnonzero(self.capture.mask)[rows]
+        directions, strengths = lamps.light_at(lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1])))
+        return np.asarray(directions * strengths[..., None], np.float64)

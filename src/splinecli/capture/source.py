@@ -5,44 +5,48 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import (
-    ESTIMATED_COLOURS,
-    GROUND_TRUTH_UPSIDE_DOWN,
-    CaptureWarning,
-    mask_inverted,
+from splinecli.capture.files import CaptureFiles
+from splinecli.capture.formats.decoders import stderr_is_apart
+from splinecli.capture.formats.facts import ImageFacts, StoredSize
+from splinecli.capture.formats.images import (
+    ExpectedSize,
+    check_memory,
+    check_stored_size,
+    common_size,
+    decode_image,
+    image_bytes,
+    read_mask,
 )
-from splinecli.capture.formats.damage import stderr_is_apart
-from splinecli.capture.formats.facts import ImageFacts
-from splinecli.capture.formats.image_size import ExpectedSize, check_capture, check_stored_size, common_size
-from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth
-from splinecli.capture.layouts.capture_files import CaptureFiles
-from splinecli.capture.lights.found_lights import LightFinder
-from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
-from splinecli.capture.lights.lamp_files import LampFiles
-from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import (
     AS_STORED,
     EVERY_PIXEL,
+    WHOLE,
     RadiometricCalibration,
     StoredPixels,
+    Window,
     collect_observations,
     pixel_reader,
 )
-from splinecli.capture.record import Capture, check_light_indices
-from splinecli.capture.restore.auto_mask import find_object, looks_inverted, surrounds_hole
-from splinecli.capture.stored import StoredCapture
-from splinecli.capture.window import WHOLE, Window
+from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
+from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
+from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Bools, Doubles, Integers
+from splinecli.maths import Bools, Doubles, Integers
+from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
+BYTES_OF_RESULTS = 52
+"""Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
+
+_IMAGES = 2  # images in memory while they are read; see read_ahead
 _IMAGES_OF_MASK = 3  # of which the brightness outside the mask is looked at
 Progress = Callable[[], object]  # called once after each image
 
@@ -265,3 +269,20 @@ def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator
             yield found
             del found  # so that no more than two are in memory
         yield waiting.result()
+
+
+def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
+    """Return the bytes that `infer` takes for a capture: observations in float32, and images or results."""
+    images = min(_IMAGES, n_lights) * image_bytes(*largest)
+    return n_pixels * 4 * n_lights + max(images, n_pixels * BYTES_OF_RESULTS)
+
+
+def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
+    """Raise InputError where a capture takes more memory than there is; see capture_bytes."""
+    height, width = largest[0][:2]
+    check_memory(
+        capture_bytes(largest, n_pixels, n_lights),
+        f"{n_lights} images of {width} x {height} pixels, {n_pixels} of them in the mask, take",
+        folder,
+        hint="Mask the object, reduce the images (infer --scale), or choose fewer lights",
+    )

@@ -1,14 +1,145 @@
-"""Printing: the reports of the commands on stdout; messages, warnings, tables and progress on stderr."""
+"""What people and programs read: reports, messages, tables and progress.
+
+Errors become one message and an exit code, and JSON documents among those of a command. Typer and click name the errors
+of their parser, such as an unknown option or a word in place of a number, differently from version to version. Only
+attributes of these errors are relied on. One without a known attribute keeps its text.
+"""
 
 import json
+import re
 import sys
+import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from splinecli.errors import printable
-from splinecli.pipeline.observer import Advance, Observer
+import typer
+
+from splinecli.capture.record import MIN_LIGHTS
+from splinecli.cli.shared import listed
+from splinecli.errors import SplinecliError, UsageError, printable
+from splinecli.system.files import as_splinecli_error
+from splinecli.system.machine import is_out_of_memory
+from splinecli.system.progress import Advance, Observer
+
+DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
+NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
+# Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
+_NUMBERS = {"int": "a whole number", "float": "a number"}
+_LIMITS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
+_SYNTAX = (
+    (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
+    (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
+    (r"^Missing argument '(.+)'\.?$", r"\1 is missing"),
+    (r"^Missing option '([^']+)'.*$", r"\1 is missing"),
+    (r"^Missing command\.?$", "a command is missing"),
+    (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
+)
+"""Click's texts as regular expressions, and the words that replace them."""
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return the message of an error that ends a command, and its exit code."""
+    if isinstance(error, SplinecliError):
+        return str(error), error.exit_code
+    if isinstance(error, ParserError):
+        return _usage_message(error), UsageError.exit_code
+    if is_out_of_memory(error):
+        return NO_MEMORY, SplinecliError.exit_code
+    if isinstance(error, OSError):
+        return explain(as_splinecli_error(error))
+    return DEFECT, SplinecliError.exit_code
+
+
+def error_document(error: Exception) -> dict[str, Any]:
+    """Return {"error", "exit_code"}, which stand in place of a report."""
+    message, exit_code = explain(error)
+    return {"error": message, "exit_code": exit_code}
+
+
+@contextmanager
+def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Yield a function that prints a document of `infer`, which has one for each capture, as soon as that ends.
+
+    Each is a line, or an item of one list. The last is that of an error that ends the command.
+    """
+    is_empty = True
+
+    def add(document: dict[str, Any]) -> None:
+        nonlocal is_empty
+        if as_lines:
+            print(json.dumps(document), flush=True)
+        elif as_list:
+            item = textwrap.indent(json.dumps(document, indent=2), "  ")
+            print("[\n" if is_empty else ",\n", item, sep="", end="", flush=True)
+        is_empty = False
+
+    try:
+        yield add
+    except Exception as error:
+        add({"capture": None, **error_document(error)})
+        raise
+    finally:
+        if as_list and not as_lines:
+            print("[]" if is_empty else "\n]")
+
+
+def _usage_message(error: Any) -> str:
+    """Return the message for a usage error of click: what was found, what was expected, and where help is."""
+    context = getattr(error, "ctx", None)
+    where = context.command_path if context else "splinecli"
+    text = _bad_value(error) or _unknown_name(error) or error.format_message()
+    for pattern, words in _SYNTAX:
+        text = re.sub(pattern, words, text)
+    end = "" if text.endswith("?") else "."
+    return f"{text.rstrip('.')}{end} See '{where} --help'."
+
+
+def _bad_value(error: Any) -> str | None:
+    details = getattr(error.__cause__, "errors", None)
+    parameter = getattr(error, "param", None)
+    if not callable(details) or not parameter:
+        return None
+    detail = details()[0]
+    option, value, limits = max(parameter.opts, key=len), detail["input"], detail.get("ctx", {})
+    kind = detail["type"].removesuffix("_parsing")
+    if kind in _NUMBERS:
+        return f"{option} is {value!r}; expected {_NUMBERS[kind]}{_range(parameter)}"
+    for limit, words in _LIMITS.items():
+        if limit in limits:
+            return f"{option} is {value}; expected {words} {limits[limit]:g}"
+    choices = re.search(r" is not one of (.+)$", detail["msg"])
+    if choices:
+        return f"{option} is {value!r}; expected one of {choices[1].replace(chr(39), '')}"
+    return None
+
+
+def _range(parameter: Any) -> str:
+    """Return the range of an option in words: " from 1", " from 0 to 1" or ""."""
+    smallest, largest = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    if smallest is None and parameter.name == "n_lights":
+        # The number of lights is checked with the other values of infer, so that --json reports it.
+        smallest = MIN_LIGHTS
+    words = "" if smallest is None else f" from {smallest:g}"
+    return words if largest is None else f"{words} to {largest:.10g}"
+
+
+def _unknown_name(error: Any) -> str | None:
+    text = error.format_message()
+    option = getattr(error, "option_name", None)
+    if option and hasattr(error, "possibilities"):
+        return f"no option {option}.{_suggestion(sorted(error.possibilities or ()))}"
+    command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
+    if command:
+        return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
+    return None
+
+
+def _suggestion(names: list[str]) -> str:
+    return f" Did you mean {listed(names)}?" if any(names) else ""
+
 
 LINE_SECONDS = 30.0  # seconds between two lines of progress where stderr is not a terminal
 

@@ -1,26 +1,28 @@
-"""`splinecli infer`: captures in, normal maps out."""
+"""`splinecli infer`, `watch` and `info`: captures in, normal maps out, or what to expect of them."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+import typer
 from typer import Argument, Option
 
-from splinecli.capture.capture_warnings import PROBABLY_WRONG
-from splinecli.capture.formats.text import to_number
-from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
+from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS
+from splinecli.capture.formats.numbers import to_number
+from splinecli.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
-from splinecli.cli.console import Messages, print_lines
-from splinecli.cli.failures import printed_documents
-from splinecli.errors import UsageError, printable
+from splinecli.cli.console import Messages, print_lines, print_report, printed_documents
+from splinecli.errors import InputError, UsageError, printable
 from splinecli.methods import method_names
-from splinecli.results.index import HEADER, INDEX, Entry, Row
+from splinecli.results.pages import HEADER, INDEX, Entry, Row
 
 if TYPE_CHECKING:
-    from splinecli.pipeline.member import Outcome, Redo
+    from splinecli.pipeline.batch import Outcome, Redo
+
 
 _WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the last line, for these outcomes
 
@@ -133,9 +135,8 @@ def infer(
     """
     given = locals()
 
-    from splinecli.pipeline.batch import infer_batch
+    from splinecli.pipeline.batch import Shard, infer_batch
     from splinecli.pipeline.infer_options import InferOptions
-    from splinecli.pipeline.member import Shard
 
     with printed_documents(as_list=as_json, as_lines=as_json_lines) as document:
         if as_json and as_json_lines:
@@ -188,8 +189,7 @@ def _show_all(
     *,
     summaries: bool,
 ) -> int:
-    from splinecli.pipeline.batch import worst_exit_code
-    from splinecli.pipeline.member import Status
+    from splinecli.pipeline.batch import Status, worst_exit_code
 
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
@@ -230,3 +230,131 @@ def _summary(report: dict[str, Any], output: Path) -> str:
         scored = f", {expected:.0%} of them likely within 5 deg{condition}"
     counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
     return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"
+
+
+_LOOK_SECONDS = 1.0  # time between two looks at the folder
+
+
+def watch(
+    context: typer.Context,
+    folder: Path = Argument(
+        ..., metavar="FOLDER", help="Folder in which captures arrive, a subfolder or film for each."
+    ),
+    options: list[str] = Argument(None, metavar="-- OPTIONS", help="Options of infer, after two dashes."),
+    marker: str | None = Option(
+        None, metavar="NAME", help="File that appears in a subfolder when it is complete. [default: see --settle]"
+    ),
+    settle: float = Option(
+        5.0,
+        metavar="SECONDS",
+        min=0,
+        help="A film, or without --marker a subfolder, is complete when nothing in it changed for so long.",
+    ),
+) -> None:
+    """Run infer on each capture that arrives in FOLDER, once it is complete.
+
+    A capture is a subfolder of FOLDER, or a film with --lights estimate. It is computed as by infer with OPTIONS, and
+    captures that are already done are skipped, so the command can be stopped and started again at any time. A capture
+    that fails does not stop it. It is tried again when its files change. If FOLDER vanishes, the command waits for it.
+    Ctrl-C or SIGTERM ends the command, with exit code 130.
+    """
+    from splinecli.pipeline.incoming import Arrivals
+
+    options = options or []
+    infer: Any = context.parent.command.get_command(context.parent, "infer")  # type: ignore[union-attr]
+    run = infer.make_context("infer", [*options, "--", str(folder)], parent=context.parent)
+    given, output = run.params, run.params["output"].expanduser()
+    if given["as_json"]:
+        raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
+    if given["shard"] is not None:
+        raise UsageError(
+            "--shard splits a list of captures, and watch has none", hint="Watch one folder for each shard"
+        )
+    if len(given["captures"]) > 1:
+        raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
+    if output.resolve() == folder.resolve():
+        raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
+    given["captures"] = []
+    infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
+    arrivals = Arrivals(folder, marker=marker, seconds=settle, without=output)
+    messages = Messages(quiet=given["quiet"])
+    messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
+    ready, is_there = arrivals.take(), True
+    while True:
+        if ready:
+            run.params["captures"] = ready
+            infer.invoke(run)
+        else:
+            time.sleep(_LOOK_SECONDS)
+        try:
+            ready = arrivals.take()
+            if not is_there:
+                messages.say(f"{folder}: the folder is there again")
+            is_there = True
+        except InputError as error:  # a network drive may be away for a moment
+            if is_there:
+                messages.warn(f"{error} Waiting for it.")
+            ready, is_there = [], False
+
+
+def info(
+    capture: Path = Argument(..., metavar="CAPTURE", help="Folder with the images of one object, or a film."),
+    lights: Path | None = shared.LIGHTS,
+    first_light: str | None = shared.FIRST_LIGHT,
+    intensities: Path | None = shared.INTENSITIES,
+    light_positions: Path | None = shared.LIGHT_POSITIONS,
+    light_distance: float | None = shared.LIGHT_DISTANCE,
+    pixel_size: float | None = Option(None, metavar="S", help=shared.PIXEL_SIZE),
+    object_width: float | None = shared.OBJECT_WIDTH,
+    camera_matrix: Path | None = shared.CAMERA_MATRIX,
+    mask: Path | None = shared.MASK,
+    crop: str | None = shared.CROP,
+    scale: str | None = shared.SCALE,
+    ground_truth: Path | None = shared.GROUND_TRUTH,
+    transfer: str = shared.TRANSFER,
+    ambient: Path | None = shared.AMBIENT,
+    flat_field: Path | None = shared.FLAT_FIELD,
+    white_level: float | None = shared.WHITE_LEVEL,
+    light_frame: str | None = shared.LIGHT_FRAME,
+    lights_format: shared.LightForm = shared.LIGHTS_FORMAT,
+    check_lights: bool = Option(
+        False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
+    ),
+    mended_lights: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Write the light directions in the order and frame that fit the images best, if the light file does not.",
+    ),
+    plot: Path | None = Option(None, metavar="FILE", help="Also plot the light directions to a PNG file."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace an earlier plot or file of lights."),
+    strict: bool = shared.STRICT,
+    as_json: bool = shared.JSON,
+    quiet: bool = shared.QUIET,
+) -> int:
+    """Show what `infer` would read from CAPTURE, without running it.
+
+    Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
+    the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing
+    but the plot and the mended lights.
+    """
+    given = locals()
+
+    from splinecli.pipeline.infer_options import Reading
+    from splinecli.pipeline.info import describe_capture, summary_lines
+
+    messages = Messages(quiet=quiet)
+    report = describe_capture(
+        capture,
+        shared.record_from(Reading, given),
+        messages,
+        plot=plot,
+        overwrite=overwrite,
+        check_lights=check_lights,
+        mended_lights=mended_lights,
+    )
+    print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)
+    wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
+    if strict and wrong:
+        messages.error(f"{capture}: an input is probably wrong ({', '.join(wrong)}), as the warnings say.")
+        return InputError.exit_code
+    return 0

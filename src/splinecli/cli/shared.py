@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     from splinecli.calibration.circle import Circle
-    from splinecli.pipeline.connection import ClusterOptions
+    from splinecli.pipeline.distribution import ClusterOptions
 
     Record = TypeVar("Record", bound=DataclassInstance)
 
@@ -37,7 +37,7 @@ Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
 
 def complete_sides() -> list[str]:
     """Return the sides that a first light may come from."""
-    from splinecli.capture.lights.found_lights import SIDES_DEG
+    from splinecli.capture.record import SIDES_DEG
 
     return [*SIDES_DEG]
 
@@ -83,7 +83,7 @@ def split_commas(text: str, option: str, allowed: Iterable[str]) -> tuple[str, .
 
 def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False) -> ClusterOptions | None:
     """Return where --workers and --cluster let tasks be done; None for this process. Raises UsageError."""
-    from splinecli.pipeline.connection import ClusterOptions
+    from splinecli.pipeline.distribution import ClusterOptions
 
     if workers != "auto" and (not workers.isdecimal() or len(workers) > 4 or int(workers) < 1):
         raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")

@@ -1,4 +1,4 @@
-"""`splinecli train`: train LI-Net and NE-Net on pixel sets, on generated pixels, or on both."""
+"""`splinecli train` and `import-weights`: weights from training, or from the authors' checkpoints."""
 
 from __future__ import annotations
 
@@ -11,13 +11,37 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.errors import UsageError, printable
+from splinecli.errors import OutputError, UsageError, printable
 from splinecli.training import defaults
 
 if TYPE_CHECKING:
     from splinecli.training.config_files import Settings
     from splinecli.training.loop import Trainer
     from splinecli.training.run_log import Metrics
+
+
+def import_weights(
+    li_net: Path = Argument(..., metavar="G.ckpt", help="The authors' LI-Net, which they call the generator."),
+    ne_net: Path = Argument(..., metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator."),
+    output: Path = Option(..., "--output", "-o", metavar="FILE.safetensors", help="The weight file to write."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace an existing file."),
+    quiet: bool = shared.QUIET,
+) -> None:
+    """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
+
+    Other commands take the weight file with --weights. Both checkpoints must come from the same training
+    step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in them is not run.
+    """
+    if output.is_dir():
+        raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")
+    if output.exists() and not overwrite:
+        raise OutputError("exists already", path=output, hint="Add --overwrite, or choose another place with -o")
+
+    from splinecli.networks.weights import import_official, save_weights
+
+    save_weights(import_official(li_net, ne_net), output)
+    if not quiet:
+        print(printable(output))
 
 
 def train(

@@ -5,22 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from splinecli import capture_warnings as codes
 from splinecli.capture import Capture, CaptureSource
-from splinecli.capture import capture_warnings as codes
-from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
-from splinecli.capture.restore.light_intensities import estimate_light_intensities
-from splinecli.capture.restore.light_refinement import would_refine
-from splinecli.capture.robust_fit import fit_robustly
-from splinecli.capture.sample import Sample, closeup_of, leave_out_background, sample_observations
+from splinecli.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.diagnosis.evidence import Evidence, gray_intensities
-from splinecli.diagnosis.frame_evidence import median_turn_deg
-from splinecli.diagnosis.ground_truth import check_ground_truth
-from splinecli.diagnosis.light_check import LightCheck
-from splinecli.diagnosis.light_warnings import light_warnings
+from splinecli.diagnosis.light_check import LightCheck, light_warnings
+from splinecli.diagnosis.odd_images import check_ground_truth
 from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
+from splinecli.diagnosis.summary import Sample, closeup_of, leave_out_background, sample_observations
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Doubles, Floats
+from splinecli.fits.robust import fit_robustly
+from splinecli.lights.light_fit import would_refine
+from splinecli.lights.rough_normals import median_turn_deg
+from splinecli.maths import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
+from splinecli.restoration.lamps import estimate_light_intensities
 
 SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
 MOST_BACKGROUND = 0.5  # share of near black pixels above which a capture without a mask carries a warning

@@ -10,19 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import CaptureSource
-from splinecli.capture.lights.light_fit import Factors, find_factors
-from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.paths import reading
-from splinecli.capture.sample import Sample
-from splinecli.diagnosis.frame_evidence import median_turn_deg
-from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
+from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
+from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.diagnosis.odd_images import ImageShift, find_shifts
 from splinecli.diagnosis.readings import Doubt, Kind, Readings
 from splinecli.diagnosis.shading_shifts import moved_back, shading_shifts
-from splinecli.maths.arrays import Doubles, Floats
-from splinecli.maths.solve_3x3 import solve_each
-from splinecli.system.files import equal_files
+from splinecli.diagnosis.summary import Sample
+from splinecli.fits.robust import solve_each
+from splinecli.lights.light_fit import Factors, find_factors
+from splinecli.lights.rough_normals import median_turn_deg
+from splinecli.maths import Doubles, Floats
+from splinecli.system.files import equal_files, reading
 
 
 @dataclass(frozen=True, eq=False)

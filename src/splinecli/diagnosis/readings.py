@@ -19,10 +19,10 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, lit_values, shade
-from splinecli.capture.sample import Sample
-from splinecli.maths.arrays import Doubles, Integers
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.diagnosis.summary import Sample
+from splinecli.fits.robust import absolute_weights, fit_scaled_normals, lit_values, shade
+from splinecli.maths import Doubles, Integers
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]

@@ -10,10 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture.robust_fit import fit_robustly
-from splinecli.capture.sample import Sample
-from splinecli.maths.arrays import Bools, Doubles
-from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.diagnosis.summary import Sample
+from splinecli.fits.robust import fit_robustly, inverse_3x3, multiply_symmetric
+from splinecli.maths import Bools, Doubles
 
 REACH, COUNTED = 0.2, 0.75
 """Shifts are compared up to this share of the smaller side of the object, and count up to that share of it: where a

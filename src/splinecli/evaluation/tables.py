@@ -1,14 +1,142 @@
-"""Evaluations as tables for people: Markdown, LaTeX, and rows for a terminal.
+"""Tests of whether methods differ by more than the draws of lights explain, and tables for people.
 
-All functions take one evaluation, or several of the same methods that differ in n_lights, light_noise_deg or both.
+All methods see the same draws, and a draw that is hard for one method is usually hard for the others. The test
+therefore uses the differences trial by trial: a paired t-test (Student, Biometrika 1908), corrected for the number of
+pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers the spread over draws
+only. A significant difference applies to other lights on this capture, not to other captures.
+
+Evaluations as tables for people: Markdown, LaTeX, and rows for a terminal. All functions take one evaluation, or
+several of the same methods that differ in n_lights, light_noise_deg or both.
 """
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.errors import printable
 from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
-from splinecli.evaluation.statistics import AVERAGE
+
+AVERAGE = "average"  # name that stands for the average over all captures, in place of a capture's name
+SIGNIFICANCE = 0.05  # p-value below which two methods differ
+
+# Error maps are float32: MAEs closer than this are equal.
+_SAME_DEG = 1e-6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The difference of two methods on one capture, or on the average over the captures, trial by trial.
+
+    There is no test with one trial, or where the differences of all trials are equal but not zero: this is one trial
+    several times. interval_deg, p_value and p_holm are then None. Where all differences are zero, the interval is
+    (0, 0) and p is 1. Differences count as equal within 1e-6 degrees, the precision of the error maps.
+    """
+
+    capture: str  # name of the capture, or AVERAGE
+    first: str
+    second: str
+    trials: int
+    # mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0
+    difference_deg: float
+    std_deg: float  # population standard deviation of the differences
+    # 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0 while p_holm is
+    # above SIGNIFICANCE.
+    interval_deg: tuple[float, float] | None
+    p_value: float | None
+    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
+
+    @property
+    def differs(self) -> bool | None:
+        """Whether p_holm is below SIGNIFICANCE; None without a test."""
+        return None if self.p_holm is None else self.p_holm < SIGNIFICANCE
+
+
+def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
+    """Return the comparison of every pair of methods on every capture, then on the average over the captures.
+
+    Trial t of the average is the mean of trial t over the captures; see trial_averages.
+    """
+    comparisons: list[Comparison] = []
+    for capture in evaluation.captures:
+        comparisons += _compare_all(capture, {r.method: r.maes_deg for r in evaluation.results if r.capture == capture})
+    averages = {method: trial_averages(evaluation, method) for method in evaluation.methods}
+    return (*comparisons, *_compare_all(AVERAGE, averages))
+
+
+def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
+    """Return the MAE of a method in degrees for each trial, averaged over the captures.
+
+    A capture with one trial only, for example because it has K lights in all, repeats it. Where the numbers of trials
+    differ otherwise, only the trials that every capture has are averaged.
+    """
+    maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
+    most = max(map(len, maes_deg))
+    repeated = [trials * most if len(trials) == 1 else trials for trials in maes_deg]
+    return tuple(float(np.mean(trial)) for trial in zip(*repeated, strict=False))
+
+
+def in_words(comparison: Comparison) -> str:
+    """Return a comparison as a sentence."""
+    c = comparison
+    better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
+    size = f"{abs(c.difference_deg):.2f} degrees"
+    if c.interval_deg is None or c.p_holm is None:
+        reason = "one trial" if c.trials == 1 else f"the same in all {c.trials} trials"
+        return f"{better} scores {size} less than {worse} ({reason}: not tested)."
+    test = f"{p_in_words(c.p_holm)}, {c.trials} trials"
+    low, high = c.interval_deg
+    if c.differs:
+        low, high = sorted((abs(low), abs(high)))
+        return f"{better} is better than {worse} by {size} (95 % interval {low:.2f} to {high:.2f}, {test})."
+    interval = f"95 % interval {low:+.2f} to {high:+.2f}"
+    details = f"{c.difference_deg:+.2f} degrees, {interval}, {test}"
+    return f"{c.first} and {c.second} do not differ significantly ({details})."
+
+
+def p_in_words(p_value: float) -> str:
+    """Return a p-value as text: "p < 0.001", "p = 0.032"."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}" if p_value < 0.1 else f"p = {p_value:.2f}"
+
+
+def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[Comparison]:
+    compared = []
+    for first, second in combinations(maes_deg, 2):
+        differences = np.subtract(maes_deg[first], maes_deg[second])
+        mean, std = float(differences.mean()), float(differences.std())
+        test = _paired_test(differences)
+        compared.append(Comparison(capture, first, second, len(differences), mean, std, *test, None))
+    corrected = iter(holm([c.p_value for c in compared if c.p_value is not None]))
+    return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
+
+
+def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] | None, float | None]:
+    """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
+    if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
+        return (0.0, 0.0), 1.0
+    if len(differences) < 2 or np.ptp(differences) < _SAME_DEG:
+        return None, None
+    from scipy import stats
+
+    test = stats.ttest_1samp(differences, 0)
+    low, high = test.confidence_interval(1 - SIGNIFICANCE)
+    return (float(low), float(high)), float(test.pvalue)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values after Holm's step-down correction.
+
+    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values do not decrease and are at most 1.
+    """
+    order = np.argsort(p_values, kind="stable")
+    stepped = np.array(p_values)[order] * np.arange(len(p_values), 0, -1)
+    corrected = np.empty(len(p_values))
+    corrected[order] = np.maximum.accumulate(stepped).clip(max=1)
+    return [float(p) for p in corrected]
+
 
 _MOST_WIDE = 6  # captures: with more, the table is set in small type, so that DiLiGenT's ten fit on a page
 _LATEX = str.maketrans(

@@ -1,16 +1,34 @@
-"""Trials and their scores. Scores are stored as they come, so that an interrupted evaluation can go on."""
+"""Trials, their scores, which are stored as they come, and what a trial sees of a capture."""
 
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from splinecli.capture.lights.draws import Draw
-from splinecli.evaluation.protocol import Protocol
-from splinecli.system.files import parse_json, refusals_as_output_errors, write_text
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture, CaptureSource, open_capture
+from splinecli.capture.record import StoredCapture, in_one_plane
+from splinecli.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
+from splinecli.diagnosis.odd_images import check_ground_truth
+from splinecli.diagnosis.summary import sample_observations
+from splinecli.errors import InputError
+from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Draw, Protocol
+from splinecli.inference import estimate_normals, find_surface
+from splinecli.lights.light_fit import refine_capture
+from splinecli.lights.unknown_lights import find_lights
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.methods import Estimator
+from splinecli.methods.estimator import refiner_of
+from splinecli.system.files import as_splinecli_error, parse_json, refusals_as_output_errors, write_text
+from splinecli.system.progress import Progress
 from splinecli.system.publishing import is_plain
 
 _LONGEST_LINE = 1 << 16  # characters
@@ -122,3 +140,195 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)
     usable = usable and isinstance(score.estimated_intensities, bool)
     return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
+
+
+_LARGEST_TILT_DEG = 89.0
+OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
+Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
+DAMAGED_IMAGES = {"bearPNG": 20}
+"""The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """A capture that was read once, from which each trial takes its lights.
+
+    Every draw is restored by itself: a saturated observation is restored from the other lights of the draw, as
+    `infer` restores it when it reads only these lights.
+
+    `rows` are the rows of the observations to score; None for all of them.
+    """
+
+    stored: StoredCapture
+    rows: NDArray[np.integer] | None = None
+
+    def see(self, trial: Trial, *, whole: bool = False) -> Capture:
+        """Return the capture under the lights of a trial, which have noise, or are refined or found, if it says so.
+
+        It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
+        """
+        protocol, rows = trial.protocol, None if whole else self.rows
+        seen = self.stored.choose_lights(self.places(trial.lights))
+        if protocol.light_noise_deg:
+            seen = replace(seen, capture=_with_noise(seen.capture, trial))
+        if protocol.finds_lights:
+            seen = seen.find_lights(partial(find_lights, refuse=False))
+        # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
+        intensities = None if protocol.as_stored else seen.estimate_intensities()
+        needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
+        if rows is not None and not needs_all:
+            seen, rows = seen.choose_pixels(rows), None
+        capture = seen.capture if protocol.as_stored else seen.restore(intensities)
+        if protocol.light_error_deg is not None:
+            known = self.stored.intensities_known
+            capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
+        if rows is None:
+            return capture
+        # Near lamps need the surface, which only all pixels together have.
+        return find_surface(capture).choose_pixels(rows)
+
+    def places(self, lights: Sequence[int]) -> list[int]:
+        """Return the places of lights among those that were read."""
+        place = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
+        return [place[light] for light in lights]
+
+
+class SharedDraw:
+    """The capture that the methods of one draw share. The first method that needs it makes it."""
+
+    def __init__(self, source: TrialSource) -> None:
+        self._source = source
+        self._lock = Lock()
+        self._captures: dict[bool, Capture] = {}
+
+    def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
+        """Return the score of a trial of the draw. Any thread may call this.
+
+        `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
+        SplinecliError if the method returns normals that are not unit vectors.
+        """
+        source, whole = self._source, refiner_of(estimator) is not None
+        with self._lock:
+            if whole not in self._captures:
+                self._captures[whole] = source.see(trial, whole=whole)
+        capture = self._captures[whole]
+        estimate = estimate_normals(capture, estimator, progress=None if begin is None else begin(capture.n_pixels))
+        assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
+        mae_deg = estimate.errors.mean
+        if source.rows is not None and capture.n_pixels != len(source.rows):
+            mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
+        light_error_deg = None
+        if capture.light_errors_deg is not None:
+            true = source.stored.capture.light_directions[source.places(trial.lights)]
+            light_error_deg = float(angle_between_deg(capture.light_directions, true).mean())
+        return Score(mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg)
+
+
+def _with_noise(capture: Capture, trial: Trial) -> Capture:
+    """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
+    generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
+    # Few lights and much noise can give lights in one plane. Such noise is drawn again.
+    for _ in range(100):
+        directions = tilt_lights(capture.light_directions, trial.protocol.light_noise_deg, generator)
+        if not in_one_plane(directions):
+            break
+    lamps = None if capture.lamps is None else capture.lamps.turned(directions)
+    return replace(capture, light_directions=directions, lamps=lamps)
+
+
+def tilt_lights(
+    light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
+
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is turned the
+    opposite way and stays above it, so that a capture may have any of the directions.
+    """
+    n_lights = len(light_directions)
+    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
+    # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
+    across = generator.normal(size=(n_lights, 3))
+    along = np.einsum("fi,fi->f", across, light_directions)
+    across = unit(across - along[:, None] * light_directions)
+    sunk = np.cos(angle) * light_directions[:, 2] + np.sin(angle) * across[:, 2] <= 0
+    angle = np.where(sunk, -angle, angle)[:, None]
+    return unit(np.cos(angle) * light_directions + np.sin(angle) * across)
+
+
+@dataclass(frozen=True)
+class CaptureReading:
+    """What the trials of a capture need of it."""
+
+    folder: Path  # the capture's folder as it was given. Other processes open it again.
+    name: str
+    protocols: tuple[Protocol, ...]  # those that can score it. All protocols of an evaluation score the same pixels.
+    lights: tuple[int, ...]  # those of all trials, in rising order
+    whole: bool  # whether all pixels are needed: a method sees neighbours, or lights are refined or found
+
+    def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
+        """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
+        numbers = count(1)
+        try:
+            stored = source.read_stored(self.lights, lambda: on_image(next(numbers), len(self.lights)))
+        except OSError as error:
+            raise as_splinecli_error(error, self.folder) from error
+        first = self.protocols[0]
+        rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
+        as_stored = all(protocol.as_stored for protocol in self.protocols)
+        if len(rows) == stored.capture.n_pixels:
+            trials = TrialSource(stored)
+        elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
+            # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
+            trials = TrialSource(stored, rows)
+        else:
+            trials = TrialSource(stored.choose_pixels(rows))
+        notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
+        return trials, notes
+
+
+def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
+    """Open a capture under a protocol. Raises InputError, UsageError."""
+    try:
+        return open_capture(folder, white_level=protocol.white_level)
+    except OSError as error:
+        raise as_splinecli_error(error, folder) from error
+
+
+def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
+    """Return sentences about what is special about a capture and how the evaluation treated it."""
+    notes = []
+    skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
+    if skipped:
+        notes.append(f"{name}: the first {skipped} images are left out.")
+    elif damaged:
+        notes.append(
+            f"{name}: the first {damaged} images are known to be damaged and are used;"
+            f" --skip-first {name}={damaged} leaves them out."
+        )
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN]
+    if capture.ground_truth is not None:
+        sample = sample_observations(capture.observations, capture.mask)
+        wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
+        notes += [f"{name}: {warning}" for warning in wrong]
+        without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
+        if without:
+            notes.append(
+                f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth normal"
+                " and are not scored."
+            )
+    return tuple(notes)
+
+
+def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
+    """Return the rows of the observations that have ground truth, in rising order.
+
+    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
+    that sees neighbours estimates all pixels, and only these are scored. Raises InputError without ground truth.
+    """
+    if capture.ground_truth is None:
+        raise InputError(f"{capture.name}: the capture has no ground truth")
+    rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
+    if max_pixels is not None and len(rows) > max_pixels:
+        generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])
+        rows = np.sort(generator.permutation(rows)[:max_pixels])
+    return rows

@@ -9,16 +9,15 @@ from math import comb
 import torch
 from torch import Tensor
 
-from splinecli.fits.shadows import lit_observations
+from splinecli.fits.least_squares import lit_observations
 
 DEGREE_OBSERVATION = 2  # N1 in the paper
 DEGREE_LIGHT = 4  # N2 in the paper
 SHADOW_SHARE = 0.2  # of the pixel's quantile UNSHADED; observations below it are left out as shadows
-_MOST_EXCHANGES = 100
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
-def solve(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
+def solve_ia14(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3); see fit."""
     return fit(observations, light_directions, valid)[0]
 
@@ -117,7 +116,7 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
     fewest_wrong = linear.new_full((count,), size + 1)
     patience = linear.new_full((count,), 3)
     x = torch.zeros_like(linear)
-    for _ in range(_MOST_EXCHANGES):
+    for _ in range(100):
         system = torch.where(free[:, :, None] & free[:, None, :], hessian, eye)
         right_side = torch.where(free, linear, 0)[..., None]
         x = torch.cholesky_solve(right_side, torch.linalg.cholesky(system))[..., 0]

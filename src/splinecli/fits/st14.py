@@ -22,8 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from splinecli.fits.shadows import lit_observations
-from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.fits.least_squares import lit_observations, weighted_least_squares
 
 VIEW = (0.0, 0.0, 1.0)
 
@@ -52,7 +51,7 @@ with each further degree."""
 _ROUNDS, _STEPS = 5, 4  # estimates of the noise, and Levenberg-Marquardt steps for each
 
 
-def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
+def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
     """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for dark pixels."""
     lights = light_directions.double()
     # The normal equations square the condition number, so single precision would not be exact enough.

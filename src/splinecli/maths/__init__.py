@@ -1,0 +1,13 @@
+"""Short names for the types of arrays in signatures; docstrings give their shapes."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.integer]
+Floats = NDArray[np.floating]  # of any precision
+Singles = NDArray[np.float32]
+Doubles = NDArray[np.float64]

@@ -1,8 +1,14 @@
-"""Unit normals: length, angles, and their encoding as RGB images.
+"""Unit normals: their length, angles and errors in degrees, their pictures, and slopes and curvatures.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
+
+Slopes and curvatures need no integration, so there is no drift and no tears. For a surface z(x, y) with unit normals n
+= (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of (nx, ny) by x and y. Its determinant is
+the Gaussian curvature, because normals turn by as much as the surface does (Gauss), and half its trace is the mean
+curvature (do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).
 """
 
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -76,3 +82,113 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     is_normal = picture.any(axis=-1, keepdims=True) & (length > SHORTEST_IN_PICTURE)
     decoded: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=is_normal)
     return decoded
+
+
+@dataclass(frozen=True)
+class AngularErrors:
+    """Statistics of the angular error over the pixels that have a ground truth.
+
+    Args:
+        mean, median, p90: mean (MAE), median and 90th percentile, in degrees.
+        under_5, under_10: shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees.
+    """
+
+    mean: float
+    median: float
+    p90: float
+    under_5: float
+    under_10: float
+
+
+def angular_error_map_deg(
+    normals: NDArray[np.floating], ground_truth: NDArray[np.floating], mask: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
+
+    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a normal counts: one
+    that points the opposite way has an error of 180 degrees, not 0.
+    """
+    scored = mask & ground_truth.any(axis=-1)
+    errors = np.full(mask.shape, np.nan, np.float32)
+    # Row by row, because a map of many megapixels in float64 would need several gigabytes.
+    for row, row_scored, row_normals, row_truth in zip(errors, scored, normals, ground_truth, strict=True):
+        row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
+    return errors
+
+
+def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
+    """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are NaN."""
+    errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
+    if not errors.size:
+        return None
+    return AngularErrors(
+        mean=float(errors.mean()),
+        median=float(np.median(errors)),
+        p90=float(np.percentile(errors, 90)),
+        under_5=float((errors < 5).mean()),
+        under_10=float((errors < 10).mean()),
+    )
+
+
+SMALLEST_Z = 0.05
+"""Normals beyond 87 degrees from the camera axis have no usable slope."""
+
+CURVATURE_SIGMA = 2.0
+"""Standard deviation in pixels of the Gaussian filter of the normals before they are derived."""
+
+
+def gradient_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the surface is too steep.
+
+    Args:
+        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
+        mask: (H, W).
+    """
+    z = np.where(mask & (normal_map[..., 2] >= SMALLEST_Z), normal_map[..., 2], np.nan)
+    return np.asarray(-normal_map[..., :2] / z[..., None], np.float32)
+
+
+def curvature_of_normals(
+    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float = CURVATURE_SIGMA
+) -> NDArray[np.float32]:
+    """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
+
+    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative mean curvature.
+
+    Args:
+        normal_map, mask: see gradient_of_normals.
+        sigma: standard deviation of a Gaussian filter of the normals, in pixels. Noise falls with its square.
+    """
+    (xx, xy), (yx, yy) = (_derivatives(normal_map[..., component], mask, sigma) for component in (0, 1))
+    curvatures = np.stack(((xx + yy) / 2, xx * yy - xy * yx), axis=-1)
+    return np.where(mask[..., None], curvatures, np.nan).astype(np.float32)
+
+
+def _derivatives(
+    values: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the derivatives (H, W) of values by x (right) and y (up).
+
+    They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights. Moments of a Gaussian
+    are its derivatives. Inside, the slopes are the derivatives of the filtered values; at the mask's edge, those would
+    be too small.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    def moment(of: NDArray[np.float64], down: int, right: int) -> NDArray[np.float64]:
+        """Return the sum of the weighted `of`, times offsets to these powers."""
+        found = sigma ** (2 * (down + right)) * gaussian_filter(of, sigma, order=(down, right), mode="constant")
+        return np.asarray(found + (sigma**2 * moment(of, 0, 0) if 2 in (down, right) else 0))
+
+    inside = mask.astype(np.float64)
+    inner = np.where(mask, values, 0).astype(np.float64)
+    weight = np.maximum(moment(inside, 0, 0), 1e-9)
+    right, down, value = (moment(*m) / weight for m in ((inside, 0, 1), (inside, 1, 0), (inner, 0, 0)))
+    least = 1e-3 * sigma**2  # where the mask is a line
+    rr = moment(inside, 0, 2) / weight - right**2 + least
+    dd = moment(inside, 2, 0) / weight - down**2 + least
+    rd = moment(inside, 1, 1) / weight - right * down
+    of_right = moment(inner, 0, 1) / weight - value * right
+    of_down = moment(inner, 1, 0) / weight - value * down
+    determinant = np.maximum(rr * dd - rd**2, least**2)
+    return (dd * of_right - rd * of_down) / determinant, -(rr * of_down - rd * of_right) / determinant

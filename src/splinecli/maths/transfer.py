@@ -1,11 +1,15 @@
-"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves and tables."""
+"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and those of ICC
+profiles (ISO 15076-1)."""
 
 import re
+import struct
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
+from splinecli.maths import Doubles
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
@@ -68,3 +72,86 @@ def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArra
         return np.asarray(stored**curve, np.float32)
     power = ((stored + 0.055) / 1.055) ** 2.4
     return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)
+
+
+LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Those of cameras and screens have a few kilobytes.
+
+_SAMPLES = 4096  # of a curve that has no name
+_SAME = 1e-3  # difference of linear values below which two curves count as one
+
+
+@lru_cache(maxsize=4)
+def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
+    """Return the name and the curve of a profile; None for one that is damaged or has no single curve."""
+    try:
+        tags = _tags(profile)
+        curves = [_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
+        name = _text(tags[b"desc"]) if b"desc" in tags else ""
+    except (struct.error, ValueError, IndexError, OverflowError):
+        return None
+    stored = np.linspace(0, 1, _SAMPLES, dtype=np.float32)
+    sampled = [decode_transfer(stored, curve) for curve in curves]
+    if not curves or any(np.abs(one - sampled[0]).max() > _SAME for one in sampled):
+        return None
+    named = (curve for curve in (1.0, SRGB) if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME)
+    return name, next(named, curves[0])
+
+
+def _tags(profile: bytes) -> dict[bytes, bytes]:
+    if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
+        raise ValueError
+    (count,) = struct.unpack_from(">I", profile, 128)
+    places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))]
+    return {name: profile[start : start + length] for name, start, length in places}
+
+
+def _curve(tag: bytes) -> TransferCurve:
+    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error for no usable curve."""
+    stored = np.linspace(0, 1, _SAMPLES)
+    if tag[:4] == b"curv":
+        (count,) = struct.unpack_from(">I", tag, 8)
+        if count < 2:
+            return _checked_gamma(struct.unpack_from(">H", tag, 12)[0] / 256 if count else 1.0)
+        table = np.frombuffer(tag, ">u2", count, 12) / 65535
+        linear = np.interp(stored, np.linspace(0, 1, count), table)
+    elif tag[:4] == b"para":
+        (kind,) = struct.unpack_from(">H", tag, 8)
+        given = np.frombuffer(tag, ">i4", (1, 3, 4, 5, 7)[kind], 12) / 65536
+        if kind == 0:
+            return _checked_gamma(given[0])
+        linear = _parametric(stored, given.tolist())
+    else:
+        raise ValueError
+    if not (np.isfinite(linear).all() and (np.diff(linear) >= 0).all() and linear[-1] > linear[0]):
+        raise ValueError
+    return tuple(linear.clip(0, 1).tolist())
+
+
+def _parametric(stored: Doubles, given: list[float]) -> Doubles:
+    """Return the linear values of a parametric curve with 3, 4, 5 or 7 parameters, in the order of the standard."""
+    g, a, b = given[:3]
+    if a <= 0:
+        raise ValueError
+    c, d, e, f = {3: (0.0, -b / a, 0.0, 0.0), 4: (0.0, -b / a, *(2 * given[3:4]))}.get(
+        len(given), (*given[3:5], *(given[5:] or (0.0, 0.0)))
+    )
+    with np.errstate(over="ignore", divide="ignore"):
+        power = np.maximum(a * stored + b, 0) ** g + e
+    return np.asarray(np.where(stored >= d, power, c * stored + f))
+
+
+def _checked_gamma(gamma: float) -> float:
+    if not GAMMAS[0] <= gamma <= GAMMAS[1]:
+        raise ValueError
+    return round(float(gamma), 4)
+
+
+def _text(tag: bytes) -> str:
+    """Return the printable characters of a description, in the form of version 2 or 4."""
+    if tag[:4] == b"mluc":
+        length, start = struct.unpack_from(">II", tag, 20)
+        text = tag[start : start + length].decode("utf-16-be", "replace")
+    else:
+        (length,) = struct.unpack_from(">I", tag, 8)
+        text = tag[12 : 12 + length].decode("ascii", "replace")
+    return "".join(character for character in text[:60] if character.isprintable())

@@ -10,7 +10,7 @@ from importlib import import_module
 
 from splinecli.errors import check_one_of
 from splinecli.methods.estimator import Estimator
-from splinecli.system.devices import Device, Precision
+from splinecli.system.machine import Device, Precision
 
 __all__ = ["DEFAULT_METHOD", "Estimator", "MethodOptions", "check_method", "make_estimator", "method_names"]
 
@@ -39,7 +39,7 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
     """Return the estimator of this name.
 
     Methods that run in PyTorch (all but "ls") limit its threads to the cores that the process may use; see
-    splinecli.system.devices.use_available_cores.
+    splinecli.system.machine.use_available_cores.
 
     Raises:
         UsageError: the name, the device or a number is not valid.
@@ -60,25 +60,26 @@ def method_names() -> list[str]:
 
 
 def _least_squares(*_: object) -> Estimator:
-    from splinecli.methods.least_squares import LeastSquares
+    from splinecli.methods.estimator import LeastSquares
 
     return LeastSquares()
 
 
-def _solver(name: str, options: MethodOptions, *, module: str, batch_size: int) -> Estimator:
+def _solver(name: str, options: MethodOptions, *, fit: str, batch_size: int) -> Estimator:
     from splinecli.methods.batched import BatchedEstimator
-    from splinecli.system.devices import choose_device, use_available_cores
+    from splinecli.system.machine import choose_device, use_available_cores
 
     use_available_cores()
-    solve = import_module(f"splinecli.fits.{module}").solve
+    module, function = fit.split(".")
+    solve = getattr(import_module(f"splinecli.fits.{module}"), function)
     size = batch_size if options.batch_size is None else options.batch_size
     return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
 
 
 def _network(name: str, options: MethodOptions, *, weights: str, rotations: int, refines: bool = True) -> Estimator:
-    from splinecli.methods.networks import NetworkEstimator
+    from splinecli.methods.batched import NetworkEstimator
     from splinecli.networks.weights import resolve_weights
-    from splinecli.system.devices import choose_device, choose_precision, use_available_cores
+    from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 
     use_available_cores()
     device = choose_device(options.device)
@@ -99,10 +100,10 @@ _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
     "spline-net": partial(_network, weights="spline-net", rotations=1),
     "cnn-ps": partial(_network, weights="cnn-ps", rotations=10),
     "ls": _least_squares,
-    "ls-trimmed": partial(_solver, module="trimmed_least_squares", batch_size=8192),
-    "l1": partial(_solver, module="least_absolute", batch_size=8192),
-    "iw12": partial(_solver, module="iw12", batch_size=8192),
-    "st14": partial(_solver, module="st14", batch_size=1024),
-    "ia14": partial(_solver, module="ia14", batch_size=1024),
+    "ls-trimmed": partial(_solver, fit="least_squares.solve_trimmed", batch_size=8192),
+    "l1": partial(_solver, fit="least_squares.solve_l1", batch_size=8192),
+    "iw12": partial(_solver, fit="least_squares.solve_iw12", batch_size=8192),
+    "st14": partial(_solver, fit="st14.solve_st14", batch_size=1024),
+    "ia14": partial(_solver, fit="ia14.solve_ia14", batch_size=1024),
     "spline-net-pixelwise": partial(_network, weights="spline-net", rotations=1, refines=False),
 }

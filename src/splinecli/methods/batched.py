@@ -1,19 +1,27 @@
-"""Estimators made of one torch function: they split the pixels into batches and scale each pixel."""
+"""Estimators in torch, which split the pixels into batches: fits of reflectance models, SPLINE-Net and CNN-PS."""
 
+from __future__ import annotations
+
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.errors import UsageError
-from splinecli.maths.observation_map import map_scale
-from splinecli.methods.estimator import Directions, Observations, directions_at
-from splinecli.methods.least_squares import TOWARDS_CAMERA
+from splinecli.errors import ModelError, UsageError
+from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
+from splinecli.methods.estimator import TOWARDS_CAMERA, UNKNOWN_ERROR, Directions, Observations, directions_at
+from splinecli.networks.set_branch import CaptureContext, sample_of
+from splinecli.networks.spline_net import Rotation
+from splinecli.networks.weights import LoadedNetwork
+from splinecli.refinement.refiner import NetworkRefiner
+from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
 
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
@@ -102,3 +110,181 @@ def estimate_in_batches(
         if progress is not None:
             progress(count)
     return results
+
+
+Precision = Literal["float32", "bfloat16"]
+
+_CANDIDATES = 4096  # pixels from which those are chosen that the others see
+
+ROTATION_SPAN_DEG = 20.0
+"""Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
+
+
+class NetworkEstimator:
+    """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
+
+    Args:
+        name: the method's name in the registry.
+        precision: the number format of the convolutions.
+        refines: whether the refinement net, if the weights have one, corrects the map afterwards.
+        rotations: number R of averaged estimates, see `rotations_of`.
+        batch_size: pixels per batch; memory grows with it (about 0.25 MB a pixel).
+
+    Raises:
+        ModelError: the weights are the other method's.
+        UsageError: rotations or batch_size is below 1.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loaded: LoadedNetwork,
+        *,
+        device: torch.device | str = "cpu",
+        precision: Precision = "bfloat16",
+        refines: bool = True,
+        rotations: int = 1,
+        batch_size: int = 1024,
+    ) -> None:
+        interpolates = loaded.network.config.interpolates
+        if interpolates == (name == "cnn-ps"):
+            kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
+            problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
+            raise ModelError(problem, hint=f"Use them with --method {fitting}")
+        if rotations < 1 or batch_size < 1:
+            raise UsageError("rotations and batch size are whole numbers from 1")
+        self.name, self.weights = name, {"name": loaded.name, "sha256": loaded.sha256}
+        self.device, self.precision, self.batch_size = str(device), str(precision), batch_size
+        self.network = loaded.network.to(device)
+        refine_net = self.network.refine_net
+        self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
+        self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
+        if rotations > 1 and self.network.config.sees_capture:
+            self.fingerprint += " of the capture, too"  # trials of before, when they saw one context, do not fit
+        if self.refiner is not None:
+            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
+        self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
+        self._contexts: list[CaptureContext | None] = [None] * rotations  # as each rotation shows the capture
+
+    @torch.no_grad()
+    def for_capture(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+        """Return this estimator for the pixels of one capture, of which it has seen a sample.
+
+        Without it, the pixels of each call of `estimate` count as a capture. For the arguments, see the function
+        `for_capture`.
+        """
+        if not self.network.config.sees_capture or not n_pixels:
+            return self
+        light = light_of(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
+        rows = sample_of(light.observations)
+        sample, lights = (
+            torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for values in (light.observations[rows], directions_at(light.directions, rows))
+        )
+        found = copy.copy(self)
+        # One thread, so that the number of threads does not change the rounding.
+        bfloat16 = torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16")
+        with one_thread_each(), bfloat16:
+            found._contexts = [self.network.look_at(sample, lights, rotation) for rotation in self._rotations]
+        return found
+
+    def estimate(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> NDArray[np.float32]:
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
+
+    @property
+    def tells_confidence(self) -> bool:
+        return self.network.config.error_head
+
+    def estimate_with_error(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
+
+        The numbers of the distributions are means over the rotations, and 0 without an error head.
+        """
+        if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
+            alone = self.for_capture(
+                lambda rows: LampLight(observations[rows], directions_at(light_directions, rows)), len(observations)
+            )
+            return alone.estimate_with_error(observations, light_directions, progress=progress)
+        results = estimate_in_batches(
+            self._average_rotations,
+            observations,
+            light_directions,
+            batch_size=self.batch_size,
+            device=self.device,
+            dtype=torch.float32,
+            columns=5,
+            progress=progress,
+        )
+        return results[:, :3], results[:, 3:]
+
+    def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
+        """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""
+        total = batch.new_zeros(len(batch), 5)
+        with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+            for rotation, context in zip(self._rotations, self._contexts, strict=True):
+                normals, error = self.network(batch, lights, rotation=rotation, context=context)
+                total[:, :3] += normals
+                if error is not None:
+                    total[:, 3:] += error
+        unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
+        averaged = torch.cat((unit, total[:, 3:] / len(self._rotations)), dim=1)
+        dark = batch.amax(dim=1) <= 0
+        averaged[dark] = averaged.new_tensor((0.0, 0.0, 0.0, *UNKNOWN_ERROR))
+        return averaged
+
+    @torch.inference_mode()
+    def maps(
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        all_observations: Observations,
+        all_directions: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return the observation maps of some pixels: the network's input, LI-Net's output, and all observations.
+
+        Args:
+            observations, all_observations: (P, F) and (P, F') of the same pixels.
+            light_directions, all_directions: (F, 3) and (F', 3).
+
+        Returns:
+            The sparse maps, LI-Net's dense maps, and the sparse maps of all lights. Each is (P, w, w) in the pixels'
+            own frames, divided by the largest of the pixel's F observations, and NaN in empty cells.
+        """
+        network, config = self.network, self.network.config
+        seen, lights, all_seen, all_lights = (
+            torch.as_tensor(values, dtype=torch.float32, device=self.device)
+            for values in (observations, light_directions, all_observations, all_directions)
+        )
+        maps = network.build_maps(seen, lights)
+        dense = network.interpolate(maps)
+        assert dense is not None, "CNN-PS has no dense maps"
+        all_lights = all_lights.expand(len(observations), -1, 3)
+        turned = rotate_about_view_axis(all_lights, maps.cosine[:, None], maps.sine[:, None])
+        values = all_seen / maps.scale
+        every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
+
+        def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:
+            return np.asarray(values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
+
+        inside = network.inside.expand_as(dense)
+        return known(maps.sparse, maps.occupied), known(dense, inside), known(every.values, every.occupied)
+
+
+def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:
+    """Return `count` rotations of the lights about the view axis.
+
+    A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles change nothing for
+    a network with a canonical azimuth. It gets small angles across ROTATION_SPAN_DEG, which move the lights over the
+    borders of the cells, and each angle once more with mirrored lights.
+    """
+    if not canonical:
+        return [Rotation(360.0 * k / count) for k in range(count)]
+    turns = (count + 1) // 2
+    span = ROTATION_SPAN_DEG if turns > 1 else 0.0
+    step = span / max(turns - 1, 1)
+    return [Rotation(step * (k // 2) - span / 2, mirror=k % 2 == 1) for k in range(count)]

@@ -6,32 +6,208 @@ at some 80 times the speed. What the perceptron does not follow is mostly the ne
 Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from splinecli.errors import UsageError
-from splinecli.light.lamp_light import LightOf
+from splinecli.fits.least_squares import weighted_least_squares
+from splinecli.lights.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.observation_map import map_scale
 from splinecli.methods.estimator import (
+    FEWEST_PIXELS,
+    TOWARDS_CAMERA,
     UNKNOWN_ERROR,
     ConfidentEstimator,
     Directions,
     Observations,
+    StudentSize,
     directions_at,
     for_capture,
     refiner_of,
 )
-from splinecli.methods.least_squares import TOWARDS_CAMERA
-from splinecli.methods.pixel_sample import PixelSample, draw_sample
-from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize
-from splinecli.networks.error_head import median_error_deg
-from splinecli.networks.perceptron import Perceptron
+from splinecli.networks.li_ne_net import median_error_deg
+from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
+
+CELLS = 256  # number of groups of pixels of like appearance
+EVEN_SHARE = 0.5  # Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups.
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """A sample of pixels, and the appearances that it covers."""
+
+    rows: Tensor  # (N,) distinct numbers of the pixels. The first EVEN_SHARE are an even sample of all pixels
+    centres: Tensor  # (K, C), the features at the centres of the groups
+    rare: Tensor  # (K,) bool, the groups of fewest pixels
+    reach: float  # the largest distance of a pixel, among those that could be drawn, from the nearest centre
+
+    def unlike(self, features: Tensor) -> Tensor:
+        """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
+        from_rare, from_others = (_nearest(features, self.centres[group]) for group in (self.rare, ~self.rare))
+        # Rounding must not make a pixel unlike itself.
+        return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
+
+
+def _nearest(features: Tensor, centres: Tensor) -> Tensor:
+    """Return the distances (P,) of features (P, C) from the nearest of centres (K, C); infinity if there are none."""
+    if not len(centres):
+        return torch.full_like(features[:, 0], torch.inf)
+    # Twice as fast as torch.cdist.
+    rest = torch.addmm(centres.square().sum(dim=1), features, centres.T, alpha=-2).amin(dim=1)
+    return (rest + features.square().sum(dim=1)).clamp(min=0).sqrt()
+
+
+def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0) -> PixelSample:
+    """Draw a sample of `size` pixels, or half of all pixels if that is less.
+
+    The pixels are grouped around centres: each further centre is the pixel farthest from all centres so far (Gonzalez,
+    Clustering to minimize the maximum intercluster distance, 1985). Rare appearances thereby get groups of their own.
+
+    Args:
+        features: (P, C) of the pixels that may be drawn, in any order.
+        generator: on the CPU.
+        rare_share: largest share of the pixels in groups that count as rare.
+    """
+    order = torch.randperm(len(features), generator=generator)
+    size = min(size, len(features) // 2)
+    n_even = round(EVEN_SHARE * size)
+    centres, nearest, reach = _group(features)
+    counts = torch.bincount(nearest, minlength=len(centres))
+    by_count = torch.argsort(counts, stable=True)
+    rare = torch.empty_like(counts, dtype=torch.bool)
+    rare[by_count] = counts[by_count].cumsum(0) <= rare_share * int(counts.sum())
+    left = order[n_even:]
+    # One pixel of each group in turn, until there are enough.
+    turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
+    rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
+    return PixelSample(rows, features[centres], rare, reach)
+
+
+def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Return the pixels (K,) at the centres, the group of each pixel (P,), and the largest distance from a centre."""
+    centres = [int(((features - features.mean(dim=0)) ** 2).sum(dim=1).argmin())]
+    squares = (features * features).sum(dim=1)
+    distance = torch.full_like(squares, torch.inf)
+    nearest = torch.zeros(len(features), dtype=torch.long, device=features.device)
+    for number in range(min(CELLS, len(features))):
+        centre = centres[number]
+        new = squares - 2 * (features @ features[centre]) + squares[centre]
+        nearest[new < distance] = number
+        distance = torch.minimum(distance, new)
+        centres.append(int(distance.argmax()))
+    reach = float(distance.amax().clamp(min=0).sqrt())
+    return torch.tensor(centres[:-1], device=features.device), nearest, reach
+
+
+def _rank_in_group(groups: Tensor) -> Tensor:
+    """Return how many earlier pixels are in the group of each pixel (P,)."""
+    by_group = torch.argsort(groups, stable=True)
+    counts = torch.bincount(groups)
+    rank = torch.empty_like(groups)
+    rank[by_group] = torch.arange(len(groups)) - (counts.cumsum(0) - counts)[groups[by_group]]
+    return rank
+
+
+BATCH = 256
+_LEARNING_RATE = 3e-3
+_ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
+
+
+class Perceptron(nn.Module):
+    """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
+
+    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own. The hidden
+    layers are `width` wide. The generator draws the weights.
+    """
+
+    solve: Tensor | None
+    mean: Tensor
+    spread: Tensor
+
+    def __init__(self, light_directions: Tensor, width: int, generator: torch.Generator) -> None:
+        super().__init__()
+        near = light_directions.ndim == 3
+        n_inputs = light_directions.shape[-2] + (6 if near else 3)
+        self.register_buffer("solve", None if near else torch.linalg.pinv(light_directions.double()).T.float())
+        self.register_buffer("mean", torch.zeros(n_inputs))
+        self.register_buffer("spread", torch.ones(n_inputs))
+        with torch.random.fork_rng(devices=[]):  # the layers draw weights that are replaced below
+            hidden = [nn.Linear(wide, width) for wide in (n_inputs, width, width)]
+            self.last = nn.Linear(width, 5)
+        for layer in (*hidden, self.last):
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
+            nn.init.zeros_(layer.bias)
+        nn.init.zeros_(self.last.weight)  # learning begins at least squares
+        self.hidden = nn.Sequential(*(part for layer in hidden for part in (layer, nn.ReLU())))
+
+    def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
+        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3).
+
+        Between them stands the mean direction (P, 3) of lights (P, F, 3), because it says where a pixel is.
+        """
+        scaled = observations / map_scale(observations)
+        if self.solve is not None:
+            return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
+        fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
+        return torch.cat((scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1)
+
+    def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
+        """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/li_ne_net.py.
+
+        Args:
+            inputs: (P, C), see `inputs`.
+            bfloat16: whether the hidden layers compute in it. The rest is in float32.
+        """
+        scaled = (inputs - self.mean) / self.spread
+        with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            hidden = self.hidden(scaled)
+        found = self.last(hidden.to(inputs.dtype))
+        return nn.functional.normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
+
+    @one_thread_each()
+    def learn(
+        self,
+        inputs: Tensor,
+        normals: Tensor,
+        errors: Tensor,
+        *,
+        steps: int,
+        generator: torch.Generator,
+        progress: Callable[[], object] | None = None,
+    ) -> None:
+        """Learn the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls `progress` after each step."""
+        with torch.no_grad():
+            self.last.bias[3:] = errors.mean(dim=0)
+        self.mean.copy_(inputs.mean(dim=0))
+        self.spread.copy_(inputs.std(dim=0) + 1e-3)
+        optimiser = torch.optim.AdamW(
+            self.parameters(), lr=_LEARNING_RATE, weight_decay=1e-4, betas=(0.9, 0.99), fused=True
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _LEARNING_RATE, total_steps=steps + 1, pct_start=0.1)
+        order = torch.empty(0, dtype=torch.long)
+        for _ in range(steps):
+            if len(order) < BATCH:
+                order = torch.randperm(len(inputs), generator=generator)
+            rows, order = order[:BATCH].to(inputs.device), order[BATCH:]
+            found, found_errors = self(inputs[rows])
+            # The angle, not its square: the estimator's own outliers must not draw the normals of other pixels.
+            angle = (((found - normals[rows]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
+            loss = angle.mean() + 0.05 * (found_errors - errors[rows]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            if progress is not None:
+                progress()
+
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 

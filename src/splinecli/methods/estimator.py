@@ -1,18 +1,48 @@
-"""The interface that every method of photometric stereo implements."""
+"""The interface that every method of photometric stereo implements, and least squares; imported without PyTorch.
+
+LS: Lambertian least squares. R. J. Woodham, "Photometric method for determining surface orientation from multiple
+images", 1980.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.fits.robust import solve_each
+from splinecli.maths.normals import unit
 from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
-    from splinecli.light.lamp_light import LightOf
+    from splinecli.lights.lamp_light import LightOf
     from splinecli.refinement.refiner import NetworkRefiner
+
+
+FEWEST_PIXELS = 64  # the smallest sample that can be learned from
+
+
+@dataclass(frozen=True)
+class StudentSize:
+    """How much is learned."""
+
+    sample: int  # number of pixels that the network estimates
+    steps: int  # steps of learning
+    width: int  # units in each hidden layer of the perceptron
+
+
+def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
+    """Return the usual size for a capture of n_pixels, and the size where that one is not enough.
+
+    Each pixel of the sample is learned some 25 times.
+    """
+    usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
+    larger = min(3 * usual, n_pixels // 2)
+    return StudentSize(usual, max(500, usual // 10), 192), StudentSize(larger, max(500, larger // 10), 320)
+
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
@@ -79,7 +109,7 @@ class ConfidentEstimator(Estimator, Protocol):
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
-        networks/error_head.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
+        networks/li_ne_net.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
         """
         ...
 
@@ -126,6 +156,35 @@ def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions (P, 2)."""
     import torch
 
-    from splinecli.networks.error_head import probability_within
+    from splinecli.networks.li_ne_net import probability_within
 
     return np.asarray(probability_within(torch.from_numpy(errors), CONFIDENT_DEG).numpy(), np.float32)
+
+
+TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is dark under every light
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Minimise |I - L b| over all observations, including shadows; n = b / |b|. In float64 on the CPU."""
+
+    name: str = "ls"
+    weights: None = None
+    device: str = "cpu"
+    precision: str = "float64"
+    fingerprint: str = "ls"
+
+    def estimate(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> NDArray[np.float64]:
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
+        values = observations.astype(np.float64)
+        if light_directions.ndim == 2:
+            scaled = values @ np.linalg.pinv(light_directions).T
+        else:
+            scaled = solve_each(values, light_directions)
+        normals: NDArray[np.float64] = unit(scaled)
+        normals[~scaled.any(axis=1)] = TOWARDS_CAMERA
+        if progress is not None:
+            progress(len(normals))
+        return normals

@@ -1,14 +1,55 @@
-"""Network configurations: everything that rebuilds a network. A weight file stores its configuration."""
+"""Network configurations: everything that rebuilds a network, and the fits that it may start from."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Literal, get_args, get_type_hints
 
+import torch
+from torch import Tensor
+
 from splinecli.errors import ModelError
+from splinecli.fits.ia14 import solve_ia14
+from splinecli.fits.least_squares import solve_iw12, weighted_least_squares
 from splinecli.maths.observation_map import MAP_SIZE, Grid
-from splinecli.networks.set_branch import HEAD_WIDTH
-from splinecli.networks.starting_fits import STARTING_FITS
+
+HEAD_WIDTH = 16  # channels of an attention head of the set branch
+
+
+def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
+    return weighted_least_squares(observations, light_directions, valid.to(observations.dtype))[0]
+
+
+STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "ls": _least_squares,
+    "iw12": solve_iw12,
+    "iw12-all": partial(solve_iw12, shadow_share=0),
+    "ia14": solve_ia14,
+}
+"""Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better on metals."""
+
+
+@torch.no_grad()
+def fit_normals(
+    names: Sequence[str], observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
+) -> Tensor:
+    """Return unit normals (P, K, 3) of K fits among STARTING_FITS, zero where a fit has none.
+
+    The observations (P, F) have a largest value of 1 in each pixel. The light directions are unit, (F, 3) or (P, F, 3).
+    `valid` is (P, F) bool, all by default.
+    """
+    if not names:
+        return observations.new_zeros(len(observations), 0, 3)
+    if valid is None:
+        valid = torch.ones_like(observations, dtype=torch.bool)
+    # A subtracted dark frame leaves negative values in shadows.
+    observed = torch.where(valid, observations, 0).clamp(min=0).double()
+    lights = light_directions.double()
+    found = torch.stack([STARTING_FITS[name](observed, lights, valid) for name in names], dim=1)
+    return torch.nn.functional.normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
+
 
 _RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "set_layers": (1, 64)}
 """Smallest and largest values of settings, of others 1 and 4096. Each layer takes memory, whatever its size."""

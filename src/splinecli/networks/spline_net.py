@@ -11,15 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from splinecli.fits.lambertian import fit_lambertian
+from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
-from splinecli.networks.capture_context import CaptureContext
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.li_net import CompactLINet, PaperLINet
-from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.networks.config import NetworkConfig, fit_normals
+from splinecli.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet, PaperNENet
 from splinecli.networks.refine_net import RefineNet
-from splinecli.networks.set_branch import SetBranch
-from splinecli.networks.starting_fits import fit_normals
+from splinecli.networks.set_branch import CaptureContext, SetBranch
 
 RESIDUAL_LIMIT = 3.0
 

@@ -1,7 +1,24 @@
-"""Weight files: safetensors with the configuration of the network and a checksum. Nothing is unpickled."""
+"""Weight files: safetensors with the configuration of the network and a checksum, and the import of the authors' own
+(Zheng et al., ICCV 2019). Nothing is unpickled.
+
+Their PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). Our network of size
+"paper" has the same layers but other conventions. The import changes the weights once to account for these:
+
+- Rows: in their maps y grows with the row, in ours it falls. Every kernel is flipped along its height, and so are the
+  map rows that the first linear layer reads. All paddings are symmetric and all sizes even, so the result is the
+  flipped result of their network.
+- Channels: theirs are (dense, sparse), ours are (sparse, dense).
+- Cells and disc: the setting grid = "cnn-ps".
+
+Their normals are assumed to be in our frame: x right, y up, z to the camera.
+"""
 
 import hashlib
 import json
+import pickletools
+import warnings
+import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -13,12 +30,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from splinecli.errors import ModelError
+from splinecli.errors import InputError, ModelError
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.error_head import CaptureHead
+from splinecli.networks.li_ne_net import CaptureHead
 from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
-from splinecli.system.files import expanded, file_sha256, is_special, parse_json, utf8_name, write_bytes
+from splinecli.system.files import check_file, expanded, file_sha256, is_special, parse_json, utf8_name, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
@@ -231,3 +248,152 @@ def _check_shipped(path: Path, sha256: str, name: str) -> None:
             f"the shipped weights {name!r} were changed: their SHA-256 does not match weights.json",
             hint="Reinstall splinecli",
         )
+
+
+# Our module names and theirs of NE-Net. LI-Net differs in the name of its sequences.
+_NE_NET_MODULES = {
+    "stem": "conv1",
+    "dense1.first": "denseblock1_1.1",
+    "dense1.second": "denseblock1_2.1",
+    "transition1": "transition.1",
+    "dense2.first": "denseblock2_1.1",
+    "dense2.second": "denseblock2_2.1",
+    "transition2": "conv2",
+    "hidden": "dense.0",
+    "out": "dense.1",
+}
+_MOST_NAMES = 5
+_MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
+"""Records of an archive, bytes and instructions of a pickle. The authors' have some dozens, 10 kB and 2,000."""
+
+
+def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
+    """Return the authors' network, float32, in evaluation mode, from two files of state dictionaries.
+
+    Their generator (G) is LI-Net, their discriminator (D) NE-Net. Dropout is off in evaluation mode, while the authors'
+    test code leaves it on. Raises ModelError if a file cannot be read or is not a state dictionary, or a tensor is
+    missing, unknown, of another shape or not finite.
+    """
+    network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
+    assert network.li_net is not None  # this configuration interpolates
+    tensors = _flip_rows(_read_li_net(li_net_file, network.li_net), "li_net.")
+    ne_net = _read_ne_net(ne_net_file, network.ne_net)
+    side = network.config.map_size // 2
+    hidden = ne_net["hidden.weight"]
+    ne_net["hidden.weight"] = hidden.reshape(len(hidden), -1, side, side).flip(2).flatten(1)
+    ne_net["stem.weight"] = ne_net["stem.weight"].flip(1)
+    tensors |= _flip_rows(ne_net, "ne_net.")
+    load_strictly(network, tensors, li_net_file)
+    return network.eval()
+
+
+def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Flip every kernel (every 4-dimensional tensor) along its height."""
+    return {prefix + name: tensor.flip(2) if tensor.ndim == 4 else tensor for name, tensor in tensors.items()}
+
+
+def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
+    names = {name: name.replace("layers", "main") for name in li_net.state_dict()}
+    # Statistics that their instance norms collect in training. The authors' code normalises by the statistics of each
+    # map, also at test time (it never leaves the training mode), so these values are not used.
+    tracked: dict[str, torch.Size] = {}
+    for name, tensor in li_net.state_dict().items():
+        norm, _, kind = names[name].rpartition(".")
+        if kind == "weight" and tensor.ndim == 1:
+            tracked |= {f"{norm}.running_mean": tensor.shape, f"{norm}.running_var": tensor.shape}
+            tracked[f"{norm}.num_batches_tracked"] = torch.Size([])
+    return _rename(path, _read_state(path), li_net, names, tracked)
+
+
+def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
+    names = {}
+    for name in ne_net.state_dict():
+        module, _, parameter = name.rpartition(".")
+        names[name] = f"{_NE_NET_MODULES[module]}.{parameter}"
+    return _rename(path, _read_state(path), ne_net, names, {})
+
+
+def _rename(
+    path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
+) -> dict[str, Tensor]:
+    """Return their tensors under our names, float32; `names` gives theirs by ours, `dropped` the shapes not needed."""
+    hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
+    shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
+    missing = [name for name in shapes if name not in state]
+    if missing:
+        raise ModelError(f"has no {_listed(missing)}", path=path, hint=hint)
+    shapes |= dropped
+    unknown = [name for name in state if name not in shapes]
+    if unknown:
+        raise ModelError(f"has {_listed(unknown)}, which the network does not have", path=path, hint=hint)
+    for name, tensor in state.items():
+        if tensor.shape != shapes[name]:
+            found, expected = tuple(tensor.shape), tuple(shapes[name])
+            raise ModelError(f"tensor {name!r} has the shape {found}, expected {expected}", path=path)
+    for name in names.values():
+        if not state[name].is_floating_point():
+            raise ModelError(f"tensor {name!r} is of {state[name].dtype}, expected real numbers", path=path)
+        # Weight files are float16.
+        if not torch.isfinite(state[name].half()).all():
+            raise ModelError(f"tensor {name!r} has values that are not finite, or too large", path=path)
+    return {ours: state[theirs].float() for ours, theirs in names.items()}
+
+
+def _read_state(path: Path) -> dict[str, Tensor]:
+    """Read the tensors of a file that torch.save wrote. Only tensors and plain containers are unpickled."""
+    hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
+    try:
+        check_file(path, "a checkpoint")
+        check_length(path, hint)
+        _check_content(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the errors below cover what PyTorch warns of
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except InputError as error:
+        raise ModelError(error.problem, path=path, hint=hint) from error
+    except ModelError:
+        raise
+    except OSError as error:
+        raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
+    except Exception as error:  # damaged pickles raise many kinds of errors
+        raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor) for name, tensor in state.items()
+    ):
+        raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
+    return state
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
+
+
+def _check_content(path: Path) -> None:
+    """Raise ValueError for a checkpoint that would take far more memory than it has bytes.
+
+    It may be an archive, as torch.save writes since 1.6, whose records are not compressed; or pickles and numbers.
+    """
+    with path.open("rb") as file:
+        if file.read(4) == b"PK\3\4":
+            # Before the directory is read: each record has such a mark in it.
+            if sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b"")) > _MOST_RECORDS:
+                raise ValueError("too many records")
+            records = zipfile.ZipFile(file).infolist()
+            expanded = sum(record.file_size for record in records)
+            pickled = sum(record.file_size for record in records if record.filename.endswith(".pkl"))
+            if expanded > path.stat().st_size or pickled > _LONGEST_PICKLE:
+                raise ValueError("records that are compressed, or too many tensors")
+            return
+        file.seek(0)
+        steps = 0
+        for _ in range(5):  # a mark, the version, the system, the tensors, and the names of their numbers
+            for _ in pickletools.genops(file):
+                steps += 1
+                if steps > _MOST_STEPS:
+                    raise ValueError("too many tensors")
+
+
+def _listed(names: Iterable[str]) -> str:
+    quoted = [repr(name) for name in names]
+    more = len(quoted) - _MOST_NAMES
+    return ", ".join(quoted[:_MOST_NAMES]) + (f" and {more} more tensors" if more > 0 else "")

@@ -1,24 +1,256 @@
-"""Run `infer` on many captures, in this process or on others, and go on past a capture that fails."""
+"""Run `infer` on many captures, in this process or on others, and go on past a capture that fails.
+
+The captures of a batch of `infer`. A folder that is given twice counts once. A capture whose results are up to date is
+skipped. The error of one that fails is kept.
+"""
+
+from __future__ import annotations
 
 import os
+import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
-from splinecli.errors import InputError, ModelError, SplinecliError
-from splinecli.methods import Estimator, MethodOptions
-from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
-from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
-from splinecli.pipeline.infer import make_method
-from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.member import Member, Outcome, Redo, Shard, failed, list_captures, run_member
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
-from splinecli.system.files import check_writable, write_text
-from splinecli.system.publishing import held_folder
+from splinecli import __version__
+from splinecli.capture import capture_name
+from splinecli.capture.files import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
+from splinecli.capture.formats.film import is_film
+from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
+from splinecli.methods import Estimator, MethodOptions, method_names
+from splinecli.pipeline.distribution import SAME_STORAGE, ClusterOptions, Item, LostError, distributor, this_worker
+from splinecli.pipeline.incoming import unpacked
+from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256, make_method
+from splinecli.pipeline.infer_options import BASE_BYTES, InferOptions, source_bytes
+from splinecli.results.files import UnfinishedError, read_report
+from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
+from splinecli.system.files import NoRoomError, as_splinecli_error, check_writable, find_mode, resolve, write_text
+from splinecli.system.machine import available_memory, choose_device, count_available_cores, is_out_of_memory
+from splinecli.system.progress import SILENT, Observer
+from splinecli.system.publishing import held_folder, is_plain
+
+_SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
+
+
+class Shard(NamedTuple):
+    """Part `number` of a batch of `n_parts`, counted from 1."""
+
+    number: int
+    n_parts: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Return the shard of "3/8". Raises UsageError."""
+        found = _SHARD.fullmatch(text)
+        if found is None:
+            raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
+        number, count = int(found[1]), int(found[2])
+        if not 1 <= number <= count:
+            raise UsageError(
+                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
+        return cls(number, count)
+
+
+@dataclass(frozen=True)
+class Member:
+    """A capture of a batch. `missing` says why it cannot be read, if there is no such folder."""
+
+    folder: Path
+    name: str
+    missing: InputError | None = None
+
+
+def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
+    """Return the captures in the order given. A folder that is given twice counts once.
+
+    Raises UsageError if two captures have the same name, or a "folder" that does not exist is the name of a map, format
+    or method.
+    """
+    folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
+    chosen = set(folders)
+    if shard is not None:
+        # In the order of their bytes: a shell sorts captures/* by its language, and the machines of a cluster may
+        # differ in that.
+        chosen = set(sorted(folders, key=os.fsencode)[shard.number - 1 :: shard.n_parts])
+    # Also of the other shards, because their results go to the same place.
+    members = {folder: _member(folder) for folder in folders}
+    seen: dict[str, Path] = {}
+    for folder, member in members.items():
+        if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each other",
+                hint="Run them one by one with different -o",
+            )
+    return [member for folder, member in members.items() if folder in chosen]
+
+
+def _own_path(folder: Path) -> Path:
+    """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
+    try:
+        return resolve(folder) if ".." in folder.parts else folder.absolute()
+    except InputError:
+        return folder  # what is wrong with it is reported when its turn comes
+
+
+def _member(folder: Path) -> Member:
+    """Return the capture in the folder. Raises UsageError for a word of another option."""
+    # What is wrong with a folder that cannot be read is reported when its turn comes.
+    try:
+        exists = find_mode(folder) is not None
+    except InputError:
+        exists = True
+    if exists:
+        try:
+            return Member(folder, capture_name(folder))
+        except InputError:
+            return Member(folder, folder.name)
+    if str(folder) in (*MAPS, *NORMALS, *method_names()):
+        raise UsageError(
+            "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
+        )
+    kind = "film" if is_film(folder) else "folder"
+    return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
+
+
+Redo = Literal["nothing", "changed", "all"]  # of the captures that have results
+
+Status = Literal["done", "skipped", "changed", "missing", "failed"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one capture."""
+
+    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (there is no such
+    # folder) or failed
+    status: Status
+    report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
+    exit_code: int = 0
+    trace: str = ""  # the Python traceback of an error that splinecli did not expect
+
+
+def run_member(
+    member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
+) -> Outcome:
+    """Compute one capture of a batch, unless its results are up to date or are to be kept.
+
+    `method` returns the estimator; it is called if the capture is computed. Raises UsageError or ModelError as it does:
+    they are wrong for every capture. Raises NoRoomError if the disk is full or read-only.
+    """
+    if member.missing is not None:
+        return failed(member.name, member.missing, status="missing")
+    try:
+        folder = unpacked(member.folder, Path(options.output), options, observer, redo=redo)
+        member = replace(member, folder=folder)
+        if redo != "all":
+            with held_results(member.name, options, observer) as target:
+                report = find_earlier(target, folder, options, observer.warn)
+            if report is not None:
+                return Outcome("skipped", report)
+    except ChangedError as error:
+        if redo == "nothing":
+            return failed(member.name, error, status="changed")
+    except Exception as error:
+        return _failure(member, error)
+    estimator = method()
+    try:
+        return Outcome("done", infer_capture(member.folder, options, observer, estimator=estimator))
+    except Exception as error:
+        return _failure(member, error)
+
+
+def _failure(member: Member, error: Exception) -> Outcome:
+    """Return what became of a capture that failed. Raises NoRoomError, because other folders would fail, too."""
+    trace = ""
+    if is_out_of_memory(error):
+        hint = "Close other programs, or use smaller images"
+        error = SplinecliError("there is not enough memory", path=member.folder, hint=hint)
+    elif isinstance(error, OSError):
+        error = as_splinecli_error(error, member.folder)
+    elif not isinstance(error, SplinecliError):
+        trace = "".join(traceback.format_exception(error))
+        error = SplinecliError(
+            f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
+            hint="Please report it with the lines above",
+        )
+    if isinstance(error, NoRoomError):
+        raise error
+    return failed(member.name, error, trace)
+
+
+def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed") -> Outcome:
+    """Return the outcome of a capture that has no results of this run."""
+    document = {"capture": name, "error": str(error), "exit_code": error.exit_code}
+    return Outcome(status, document, error.exit_code, trace)
+
+
+_OPTIONS = {"formats": "format", **dict.fromkeys((f"{name}_scale" for name in SCALED_MAPS), "maps")}
+"""The options of `infer` whose fields in InferOptions have other names."""
+
+
+class ChangedError(OutputError):
+    """A folder has results of other input files, other options or another version."""
+
+    def __init__(self, made: str, folder: Path) -> None:
+        hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
+        super().__init__(f"contains results made {made}", path=folder, hint=hint)
+
+
+def find_earlier(
+    target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
+) -> dict[str, Any] | None:
+    """Return the report in `target` if its results are those of the capture in `folder` and the options.
+
+    Without results it is None. If an interrupted run left some, `warn` receives a sentence about that.
+
+    Raises:
+        ChangedError: the results are not those of this capture and these options.
+        InputError: the capture cannot be read.
+        OutputError: both are one folder, which may have files of the user with the names of results.
+    """
+    try:
+        report = read_report(target)
+        earlier = InferOptions.from_dict(report["options"])
+        version, stamp = report["version"], report["inputs_sha256"]
+        if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
+            raise ValueError
+    except UnfinishedError as error:
+        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        if found is None:
+            return None
+        if not is_plain(target / REPORT) and target.samefile(folder):
+            raise OutputError(
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                path=target,
+                hint="Add --overwrite, or choose another place with -o",
+            ) from None
+        warn(f"{target}: {error}, so it is computed again")
+        return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
+        raise ChangedError("by another version", target) from None
+    if version != __version__:
+        raise ChangedError(f"by version {version}", target)
+    if earlier != options:
+        changed = [
+            option.name
+            for option in fields(options)
+            if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
+        ]
+        names = list(dict.fromkeys(f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in changed))
+        differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
+        raise ChangedError(f"with {differences}", target)
+    if stamp != inputs_sha256(options.open(folder), options.weights):
+        raise ChangedError("from other input files", target)
+    return report
+
+
+_ASKED = 16  # captures that stand for a batch
 
 
 def infer_batch(
@@ -149,3 +381,21 @@ def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
+
+
+def expected_bytes(member: Member, options: InferOptions) -> float:
+    """Return about how many bytes `infer` takes for a capture; see source_bytes."""
+    n_lights = options.n_lights or len(options.light_indices or ())
+    return source_bytes(lambda: options.open(member.folder), n_lights)
+
+
+def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
+    """Return how many captures this machine can compute side by side: by its cores, and by its memory.
+
+    A GPU computes one at a time.
+    """
+    if choose_device(options.device).type == "cuda":
+        return 1
+    asked = members[:: max(1, len(members) // _ASKED)]
+    each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
+    return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

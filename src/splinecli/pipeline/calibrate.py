@@ -8,18 +8,15 @@ from typing import Any
 
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.gray import measure_light_intensities
-from splinecli.calibration.lamp_positions import triangulate_lamps
-from splinecli.calibration.report import calibration_report, summary_lines
-from splinecli.capture.layouts.result_names import CALIBRATION
-from splinecli.capture.lights.light_files import read_light_directions, rows_text
+from splinecli.calibration.lamps import calibration_report, measure_light_intensities, summary_lines, triangulate_lamps
+from splinecli.capture.files import CALIBRATION
+from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.pictures.calibration import calibration_picture
-from splinecli.pictures.png import encode_png
-from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.pictures.maps import calibration_picture, encode_png
 from splinecli.system.files import check_free
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"

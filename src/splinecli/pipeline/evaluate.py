@@ -12,25 +12,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splinecli.capture import find_captures, open_capture
-from splinecli.capture.lights.found_lights import ESTIMATE
-from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
-from splinecli.capture.restore.white_level import check_white_level
+from splinecli.capture.record import ESTIMATE
 from splinecli.errors import InputError, ModelError, UsageError
-from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.document import TRIALS, write_results
-from splinecli.evaluation.plan import distinct_names
+from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.protocol import Evaluation, Protocol
-from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
-from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw, TrialSource, open_to_score
-from splinecli.evaluation.trials import TrialStore
+from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
+from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
+from splinecli.lights.light_fit import LIGHT_ERROR_DEG, check_light_error
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
 from splinecli.networks.weights import untrained_warning
-from splinecli.pipeline.capture_memory import source_bytes
-from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import Item, LostError, distributor
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.system.devices import count_available_cores
+from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
+from splinecli.pipeline.infer_options import source_bytes
+from splinecli.restoration.images import check_white_level
 from splinecli.system.files import check_writable
+from splinecli.system.machine import count_available_cores
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
 
 DEFAULT_TRIALS = 100

@@ -1,41 +1,160 @@
-"""Estimate the normals of one capture: read it, run the method, write the results."""
+"""Estimate the normals of one capture: read it, check it, run the method, write the results.
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+From a capture to its normals, with all checks and warnings: for `infer` and for splinecli.estimate_normals. A distilled
+estimator replaces a network on large captures, or where the user asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.formats.image_size import check_memory, results_bytes
-from splinecli.capture.layouts.result_names import FOUND_MASK, LIGHT_FILES, PAGE
-from splinecli.capture.lights.draws import draw_lights
-from splinecli.capture.restore.light_refinement import refine_capture
-from splinecli.capture.stamp import digest
-from splinecli.diagnosis.checks import check_capture
+from splinecli.capture.files import FOUND_LIGHTS, FOUND_MASK, PAGE, digest
+from splinecli.capture.formats.images import check_memory
+from splinecli.capture.source import BYTES_OF_RESULTS
+from splinecli.capture_warnings import NOT_DISTILLED, PROBABLY_WRONG, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
 from splinecli.errors import OutputError, UsageError
-from splinecli.inference import NormalEstimate
+from splinecli.evaluation.protocol import draw_lights
+from splinecli.inference import NormalEstimate, estimate_normals, find_surface, light_on
+from splinecli.lights.light_fit import refine_capture
 from splinecli.methods import Estimator, make_estimator
-from splinecli.methods.estimator import tells_confidence
-from splinecli.pictures.light_sky import sky_plot
-from splinecli.pictures.maps import albedo_picture
-from splinecli.pictures.png import encode_png
-from splinecli.pipeline.estimate import estimate_capture
+from splinecli.methods.estimator import FEWEST_PIXELS, for_capture, student_sizes, tells_confidence
+from splinecli.pictures.maps import albedo_picture, encode_png
+from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.surface import make_surface, view_of_report
+from splinecli.pipeline.integrate import BYTES_OF_SURFACE, make_surface, view_of_report
 from splinecli.results import files
-from splinecli.results.albedo import albedo_map
-from splinecli.results.page import result_page
-from splinecli.results.report import Clock, report_of
+from splinecli.results.files import albedo_map, report_of
+from splinecli.results.pages import result_page
 from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
+from splinecli.system.progress import SILENT, Advance, Clock, Observer
 from splinecli.system.publishing import Content, held_folder, refuse_link
+
+if TYPE_CHECKING:
+    from splinecli.methods.distilled import DistilledEstimator
+
+
+AUTOMATIC_FROM = 100_000
+"""Pixels from which a capture is distilled by default.
+
+Fixed, not timed: the load of a machine must not change normals. From this size on, distillation takes less than half of
+the network's time on 1 to 16 cores and on an H100, under 10 and 96 lights.
+"""
+
+
+def distil_for(
+    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
+) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
+    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
+
+    A capture under near lamps has the points of its surface. `wanted` is None for AUTOMATIC_FROM. Raises UsageError if
+    it is wanted, but the method gives no confidence, or the capture is too small.
+    """
+    if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
+        return None, []
+    if not tells_confidence(estimator):
+        return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
+    sizes = student_sizes(capture.n_pixels)
+    if sizes[0].sample < FEWEST_PIXELS:
+        return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
+    light_of = partial(light_on(capture), None)
+    teacher = for_capture(estimator, light_of, capture.n_pixels)
+    from splinecli.methods.distilled import distil
+
+    for size in sizes:
+        try:
+            with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
+                distilled = distil(teacher, light_of, capture.n_pixels, size, progress=advance)
+        except UsageError as error:  # most pixels are a dark background
+            return _refuse(wanted, f"{capture.name}: {error.problem}")
+        if distilled.distillation.is_good:
+            return distilled, []
+    text = (
+        f"The network estimated every pixel. A small one learned from a sample, but was"
+        f" {distilled.distillation.mean_deg:.1f} degrees away from it, where it expects errors of"
+        f" {distilled.distillation.expected_deg:.1f} degrees."
+    )
+    return None, [CaptureWarning(NOT_DISTILLED, text)]
+
+
+def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:
+    if wanted:
+        raise UsageError(problem, hint="Leave --distil out")
+    return None, []
+
+
+_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # as the clock calls them
+
+
+def estimate_capture(
+    capture: Capture,
+    estimator: Estimator,
+    check: Callable[[Capture], list[CaptureWarning]],
+    *,
+    refine_lights: Callable[[Capture], Capture] | None = None,
+    distil: bool | None = None,
+    strict: bool = False,
+    observer: Observer = SILENT,
+    progress: Callable[[int], object] | None = None,
+    clock: Clock | None = None,
+) -> tuple[NormalEstimate, DistilledEstimator | None]:
+    """Return the normals of a capture, which then has all warnings, and the distilled estimator if there was one.
+
+    The capture has the warnings from reading it. `check` returns those about its lights and images
+    (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
+    is called with the number of pixels that were just estimated, in place of the observer. With `strict`, a warning
+    that an input is probably wrong is an InputError. The observer is shown the stages, the clock measures them.
+    """
+    clock = clock or Clock()
+    clock.begin("check")
+    warnings = [*capture.warnings, *check(capture)]
+    refuse_if_strict(warnings, capture.name, strict=strict)
+    if refine_lights is not None:
+        before = len(capture.warnings)
+        capture = refine_lights(capture)
+        warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
+        warnings += capture.warnings[before:]
+    capture = replace(capture, warnings=tuple(warnings))
+    clock.begin("estimate")
+    capture = find_surface(capture)
+    clock.begin("distil")
+    distilled, found = distil_for(capture, estimator, distil, observer)
+    with ExitStack() as stages:
+
+        def stage(name: str) -> AbstractContextManager[Advance]:
+            stages.close()  # one bar at a time
+            clock.begin(_STAGES.get(name, "estimate"))
+            return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
+
+        advance = stages.enter_context(stage("estimating"))
+        estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
+    if estimator.weights is not None:
+        from splinecli.networks.weights import untrained_warning
+
+        texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
+        found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
+    warnings += found
+    # Others of these say why the confidence is low.
+    if not any(warning.error_deg and warning.code in PROBABLY_WRONG for warning in warnings):
+        warnings += check_confidence(estimate.expected_under_5)
+    refuse_if_strict(warnings, capture.name, strict=strict)
+    return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled
+
+
+_BYTES_OF_ALBEDO = 52
+"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
 
 
 def infer_capture(
@@ -156,7 +275,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 def _check_light_files(target: Path) -> None:
     """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
     own = files.own_light_files(target)
-    for name in LIGHT_FILES:
+    for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
             raise OutputError(
                 "the file is not from an earlier run, and --lights estimate would overwrite it",
@@ -224,3 +343,10 @@ def _make_files(
         )
         found.append([(PAGE, page)])
     return found
+
+
+def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface: bool = False) -> int:
+    """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
+    # The surface is made after what the albedo needs is free again.
+    more = max(_BYTES_OF_ALBEDO + n_lights if albedo else 0, BYTES_OF_SURFACE if surface else 0)
+    return n_pixels * (BYTES_OF_RESULTS + more)

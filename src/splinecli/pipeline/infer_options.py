@@ -1,36 +1,70 @@
-"""The options of `infer`, a frozen record that can be written as JSON and pickled, and the part that `info` has."""
+"""The options of `infer`, a frozen record that can be written as JSON and pickled, and the memory that they need."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.layouts.capture_files import check_not_empty, list_images
-from splinecli.capture.layouts.result_names import MAPS, NORMALS, SCALED_MAPS
-from splinecli.capture.lights.draws import check_draw_settings
-from splinecli.capture.lights.found_lights import ESTIMATE, LightFinder, azimuth_of
-from splinecli.capture.lights.lamp_files import LampOptions
-from splinecli.capture.lights.light_frames import parse_light_frame
-from splinecli.capture.lights.light_rows import LightForm
-from splinecli.capture.paths import check_file
+from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS, check_not_empty, list_images
+from splinecli.capture.formats.facts import StoredSize
+from splinecli.capture.light_rows import LightForm, parse_light_frame
+from splinecli.capture.linearise import parse_window
+from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import check_light_indices
-from splinecli.capture.restore.white_level import check_white_level
-from splinecli.capture.window import parse_window
-from splinecli.errors import UsageError, check_one_of
+from splinecli.capture.record import ESTIMATE, LightFinder, azimuth_of, check_light_indices
+from splinecli.capture.source import capture_bytes
+from splinecli.errors import SplinecliError, UsageError, check_one_of
+from splinecli.evaluation.protocol import check_draw_settings
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
-from splinecli.pipeline.surface import check_pixel_size
+from splinecli.pipeline.integrate import check_pixel_size
+from splinecli.restoration.images import check_white_level
 from splinecli.surface.bilateral_equations import STIFFNESS
-from splinecli.system.devices import Device, Precision
-from splinecli.system.exr import check_exr
+from splinecli.surface.surface_files import check_exr
+from splinecli.system.files import check_file
+from splinecli.system.machine import Device, Precision
+
+BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
+
+INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
+_WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
+
+
+def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
+    """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
+
+    They follow from the size of the largest image, and the numbers of pixels in the mask and of images that are read.
+    """
+    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    return capture_bytes(largest, n_pixels, n_lights) + of_pixels
+
+
+def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
+    """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
+
+    A capture that cannot be read takes none: it will fail soon. `n_lights` images are read, or all for 0.
+    """
+    try:
+        source = open_source()
+        size = source.facts[0].size
+        n_lights = n_lights or source.n_lights
+        n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
+        n_bytes = infer_bytes(size, n_pixels, n_lights)
+        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
+            n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
+    except (SplinecliError, OSError, MemoryError):
+        return 0.0
+    return float(n_bytes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +164,7 @@ class Reading:
         """Open the capture in the folder under these options. Raises InputError."""
         find: LightFinder | None = None
         if self.finds_lights:
-            from splinecli.light.unknown_lights import find_lights
+            from splinecli.lights.unknown_lights import find_lights
 
             find = partial(find_lights, first_light=self.first_light)
 
@@ -160,7 +194,7 @@ class InferOptions(Reading):
     Args:
         n_lights: None for all. light_indices: counted from 0.
         distil: False for the method on every pixel, None for distillation of large captures only.
-        formats, maps: names of `splinecli.capture.layouts.result_names.NORMALS` and MAPS.
+        formats, maps: names of `splinecli.capture.files.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
     """
 

@@ -7,23 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.calibration.view import find_view
-from splinecli.capture.capture_warnings import estimated_lights
-from splinecli.capture.lights.found_lights import FoundLights
-from splinecli.capture.lights.named_lights import check_writable, encode_lights
-from splinecli.capture.summary import CaptureSummary, summarise_capture
+from splinecli.calibration.balls import find_view
+from splinecli.capture.light_files import check_writable, encode_lights
+from splinecli.capture.record import FoundLights
+from splinecli.capture_warnings import estimated_lights
 from splinecli.diagnosis.checks import check_evidence
 from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
+from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.student_size import student_sizes
-from splinecli.pictures.light_sky import sky_plot
-from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
-from splinecli.pipeline.estimate import AUTOMATIC_FROM
-from splinecli.pipeline.films import unpacked
-from splinecli.pipeline.infer_options import Reading
-from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.methods.estimator import student_sizes
+from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.incoming import unpacked
+from splinecli.pipeline.infer import AUTOMATIC_FROM
+from splinecli.pipeline.infer_options import BASE_BYTES, Reading, infer_bytes
 from splinecli.system.files import check_free, write_bytes
+from splinecli.system.progress import SILENT, Observer
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net

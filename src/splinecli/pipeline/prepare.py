@@ -6,13 +6,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.layouts.result_names import CONTACT_SHEET
+from splinecli.capture.files import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
-from splinecli.pictures.contact_sheet import contact_sheet
-from splinecli.pictures.png import encode_png
-from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.distribution import Item, LostError, distributor
-from splinecli.pipeline.observer import SILENT, Advance, Observer
+from splinecli.pictures.maps import contact_sheet, encode_png
+from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
 from splinecli.pixel_sets.entries import (
     CaptureChangedError,
     ScenePlan,
@@ -24,6 +21,7 @@ from splinecli.pixel_sets.entries import (
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
+from splinecli.system.progress import SILENT, Advance, Observer
 from splinecli.system.publishing import held_folder
 
 

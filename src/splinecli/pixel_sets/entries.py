@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splinecli.capture import capture_name, open_capture
-from splinecli.capture.stamp import digest
-from splinecli.capture.stored import name_reading
+from splinecli.capture.files import digest
+from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
@@ -20,8 +20,8 @@ from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.relief import read_relief
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.synthesis.shapes import draw_view
-from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, free_name, replacing
+from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource

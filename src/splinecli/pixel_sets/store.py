@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError
 from splinecli.system.files import file_sha256, read_json
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.machine import is_out_of_memory
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"

@@ -32,7 +32,7 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
 
     Args:
         refined, estimated, least_squares: (3, H, W), unit normals. At least FEWEST_LIGHTS lights gave the last ones.
-        noise: (1, H, W), of least squares; see fits/two_halves.py.
+        noise: (1, H, W), of least squares; see fits/least_squares.py.
         mask: (1, H, W), 1 inside, else 0. The other maps are zero outside.
 
     Returns:

@@ -9,11 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
-from splinecli.fits.two_halves import TwoHalves, compare_halves
-from splinecli.fits.weighted_least_squares import weighted_sum
+from splinecli.fits.least_squares import (
+    LAMBERTIAN_SHADOW_SHARE,
+    TwoHalves,
+    compare_halves,
+    fit_lambertian,
+    weighted_sum,
+)
 from splinecli.maths.observation_map import dot, map_scale
-from splinecli.networks.refine_channels import MEDIAN_OFFSET, TENSOR, VECTORS, WIDTHS
+from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
 
 _LARGEST_LOG = 4.0
 _HALVES_SCALE = 3.0  # brings these small numbers near the others
@@ -29,13 +33,13 @@ def refine_features(
     signs: Tensor,
     sharpness: Tensor,
 ) -> Tensor:
-    """Return the features (P, CHANNELS) of pixels in the order of WIDTHS, each about -1 to 1.
+    """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to 1.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
         light_directions: (F, 3) or (P, F, 3), unit.
         normals: (P, 3), unit.
-        error: (P, 2), see networks/error_head.py.
+        error: (P, 2), see networks/li_ne_net.py.
         reference: the brightness of the capture, see `brightness`.
         signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
         sharpness: (2,), of the capture, see refinement/sharpness.py.
@@ -67,13 +71,13 @@ def refine_features(
         "mean": level,
         "deviation": ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
         "residual": 3 * (unexplained.square() @ mean).sqrt(),
-        "dark_share": (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
+        "dark_share": (observed < LAMBERTIAN_SHADOW_SHARE).to(observed.dtype) @ mean,
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (_HALVES_SCALE * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
         "sharpness": sharpness.expand(len(observed), -1),
     }
-    return torch.cat([features[name] for name in WIDTHS], dim=1)
+    return torch.cat([features[name] for name in FEATURE_WIDTHS], dim=1)
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:

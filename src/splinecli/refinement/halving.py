@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.lights.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.normals import unit
 from splinecli.refinement.tiles import Box, pixels_before
-from splinecli.system.side_by_side import side_by_side
+from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
 

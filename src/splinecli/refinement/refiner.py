@@ -16,20 +16,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.fits.two_halves import alternating_signs
-from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.fits.least_squares import alternating_signs
+from splinecli.lights.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
-from splinecli.networks.refine_channels import CHANNELS, channels
-from splinecli.networks.refine_net import COARSEST, Part, RefineNet, unit_maps
+from splinecli.networks.refine_net import CHANNELS, COARSEST, Part, RefineNet, channels, unit_maps
 from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.halving import HalfCapture
 from splinecli.refinement.sharpness import image_sharpness
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
-from splinecli.system.memory import return_freed_memory
+from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
-from splinecli.system.side_by_side import side_by_side
 
 MARGIN = 112
 """Pixels around a tile that are seen, a multiple of COARSEST.
@@ -106,7 +104,7 @@ class NetworkRefiner:
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
-        A pixel that is dark under every light stays as it is. See networks/error_head.py for the distributions.
+        A pixel that is dark under every light stays as it is. See networks/li_ne_net.py for the distributions.
 
         Args:
             mask: (H, W), with P true pixels.

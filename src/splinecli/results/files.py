@@ -1,18 +1,22 @@
-"""The files that `infer` writes for a capture: functions that encode them, and write all or none."""
+"""What `infer` leaves for a capture: its albedo, its report, and the files of its maps, of which all are written or
+none."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import Capture
-from splinecli.capture.layouts.result_names import (
+from splinecli import __version__
+from splinecli.capture import Capture, CaptureSource
+from splinecli.capture.files import (
     ALBEDO,
     ALBEDO_EXR,
     ALBEDO_PICTURE,
@@ -22,12 +26,12 @@ from splinecli.capture.layouts.result_names import (
     CURVATURE_PICTURE,
     CURVATURE_TIFF,
     ERROR_MAP,
+    FOUND_DIRECTIONS,
+    FOUND_INTENSITIES,
+    FOUND_LIGHTS,
     FOUND_MASK,
     GRADIENT,
     GRADIENT_TIFF,
-    LIGHT_DIRECTIONS,
-    LIGHT_FILES,
-    LIGHT_INTENSITIES,
     LIGHT_PLOT,
     NORMALS,
     OWN_FILES,
@@ -37,25 +41,166 @@ from splinecli.capture.layouts.result_names import (
     RELIEF_TIFF,
     REPORT,
 )
-from splinecli.capture.lights.light_files import rows_text
-from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
-from splinecli.maths.normals import Convention, describe, encode_picture
+from splinecli.capture.light_files import rows_text
+from splinecli.capture.linearise import StoredPixels, take_pixels
+from splinecli.capture.record import name_reading
+from splinecli.maths.normals import Convention, curvature_of_normals, describe, encode_picture, gradient_of_normals
 from splinecli.pictures.maps import (
     albedo_picture,
     confidence_picture,
+    encode_png,
     error_map_picture,
     preview_picture,
     signed_picture,
 )
-from splinecli.pictures.png import encode_png
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_tiff, file_names
-from splinecli.system.exr import encode_exr
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, encode_tiff, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
 if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
-    from splinecli.results.report import Clock
+    from splinecli.methods import Estimator
+    from splinecli.system.progress import Clock
+
+
+LIT = 0.15  # a light counts for a pixel if n.l is above this
+AGREEING = 0.3  # an observation counts within this share of the median albedo: no highlights, no cast shadows
+RESTORED_WEIGHT = 1e-3  # of a restored observation, whose colour is saturated: the others decide
+_TILE_PIXELS = 65_536
+
+
+def albedo_map(
+    source: CaptureSource,
+    capture: Capture,
+    normal_map: NDArray[np.float32],
+    progress: Callable[[], object] = lambda: None,
+) -> NDArray[np.float32]:
+    """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
+
+    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
+    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known up
+    to one factor for the whole capture unless the intensities are absolute.
+
+    The images of the source are read again, one at a time, for their colours; `progress` is called after each. The
+    capture is what the source read; under near lamps, with the points of its surface. The normal map (H, W, 3) is unit
+    in its mask. Raises InputError if an image can no longer be read.
+    """
+    normals = take_pixels(normal_map, capture.mask)
+    counts = np.empty(capture.observations.shape, np.bool_)
+    for start in range(0, len(normals), _TILE_PIXELS):
+        tile = slice(start, start + _TILE_PIXELS)
+        cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
+        counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
+    total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
+    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
+    for position, colours in enumerate(images):
+        cosines, strengths = _shading(capture, normals, slice(None), [position])
+        cosine = cosines[:, 0] * counts[:, position]
+        colours /= strengths
+        if capture.estimated_colours is not None:
+            colours /= capture.estimated_colours[position].astype(np.float32)
+        if capture.estimated_intensities is not None:
+            colours /= np.float32(capture.estimated_intensities[position])
+        weight = cosine
+        if capture.restored is not None:
+            weight = cosine * np.where(capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1))
+        colours *= weight[:, None]  # in place, because large captures need the memory
+        total += colours
+        squares += weight * cosine
+        del colours
+    albedo = np.zeros((*capture.mask.shape, 3), np.float32)
+    albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
+    return albedo
+
+
+def _shading(
+    capture: Capture, normals: NDArray[np.float32], rows: slice, positions: Sequence[int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return n.l (p, K) of some pixels under K lights, and the strengths of these: (p, K), or (1, 1) if distant."""
+    if capture.lamps is None:
+        lights = capture.light_directions[list(positions)].astype(np.float32)
+        return normals[rows] @ lights.T, np.ones((1, 1), np.float32)
+    assert capture.lamps.points is not None
+    directions, strengths = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[rows])
+    return np.einsum("pfc,pc->pf", directions, normals[rows]), strengths
+
+
+def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
+    lit = cosine > LIT
+    albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
+    # The median of the lit observations, which sorting moves to the front.
+    ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
+    middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
+    with np.errstate(invalid="ignore"):
+        close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= AGREEING * middle)
+    return close
+
+
+SCHEMA = 2  # rises when a field of the report changes its meaning
+
+
+def report_of(
+    estimate: NormalEstimate,
+    estimator: Estimator,
+    options: Mapping[str, Any],
+    inputs: str,
+    *,
+    light_file: Path | None,
+    distillation: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the report of an estimate (docs/infer.md), without the surface.
+
+    write_estimate adds `seconds`, `folder` and `files`. The options are those of `infer`, ready for JSON. `inputs` is a
+    digest that changes when an input file changes. `light_file` is None where the lights were found from the images,
+    and `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
+    """
+    capture = estimate.capture
+    intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
+    height, width = capture.mask.shape
+    return {
+        "schema": SCHEMA,
+        "capture": capture.name,
+        "method": estimator.name,
+        "weights": estimator.weights,
+        "n_lights": capture.n_lights,
+        "light_indices": list(capture.light_indices),
+        "light_file": None if light_file is None else str(light_file.absolute()),
+        "light_directions": capture.light_directions.round(6).tolist(),
+        "light_errors_deg": None if capture.light_errors_deg is None else capture.light_errors_deg.round(2).tolist(),
+        "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
+        "camera_matrix": None if capture.camera_matrix is None else capture.camera_matrix.tolist(),
+        "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
+        "n_pixels": capture.n_pixels,
+        "image_size": [width, height],
+        "device": estimator.device,
+        "precision": estimator.precision,
+        "distillation": distillation,
+        "peak_memory_mib": peak_memory_mib(),
+        "warnings": [{"code": warning.code, "text": warning.text} for warning in capture.warnings],
+        "angular_error_deg": None
+        if errors is None
+        else {name: round(value, 4) for name, value in asdict(errors).items()},
+        "expected_under_5": None if expected is None else round(expected, 4),
+        "capture_judged": None if expected is None else estimate.capture_judged,
+        "options": options,
+        "inputs_sha256": inputs,
+        "version": __version__,
+        "reading": name_reading(as_stored=options["as_stored"]),
+        "white_level": None if capture.white_level is None else asdict(capture.white_level),
+        "surface": None,
+    }
+
+
+def peak_memory_mib() -> int | None:
+    """Return the largest memory that this process has used in MiB, or None if the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
+
 
 Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
 
@@ -69,7 +214,7 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
-    The files, of OWN_FILES and LIGHT_FILES, replace those of an earlier run in the folder (see new_files), which the
+    The files, of OWN_FILES and FOUND_LIGHTS, replace those of an earlier run in the folder (see new_files), which the
     caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
@@ -90,9 +235,9 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return those of LIGHT_FILES in a folder of results that an earlier run wrote, as its report says."""
+    """Return those of FOUND_LIGHTS in a folder of results that an earlier run wrote, as its report says."""
     try:
-        return [name for name in LIGHT_FILES if name in read_report(folder)["files"]]
+        return [name for name in FOUND_LIGHTS if name in read_report(folder)["files"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
 
@@ -157,9 +302,9 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
     """Yield lights that were found from the images, as `--lights` and `--intensities` read them, and their plot."""
-    yield LIGHT_DIRECTIONS, rows_text(capture.light_directions)
+    yield FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if capture.estimated_intensities is not None:
-        yield LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
+        yield FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
     yield LIGHT_PLOT, plot
 
 

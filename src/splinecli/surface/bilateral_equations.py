@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths.arrays import Bools, Doubles, Floats
+from splinecli.maths import Bools, Doubles, Floats
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
+from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
 STIFFNESS = 2.0  # how easily the surface tears, as in the paper
@@ -112,8 +112,6 @@ def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
 # Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that no
 # equation ties to others keep their heights, and the system is never singular.
 _DAMPING_OF_GAPS = 1e-7
-_DAMPING_OF_HEIGHTS = 1e-12
-_MAX_STEPS = 200
 _STEPS_BEFORE_RENEWAL = 15  # above this number of steps, a new preconditioner saves more time than it costs
 
 
@@ -168,7 +166,7 @@ class LaplacianSolver:
             matrix,
             self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
             rtol=precision,
-            maxiter=_MAX_STEPS,
+            maxiter=200,
             M=self._preconditioner,
             callback=lambda _: next(steps),
         )
@@ -179,7 +177,7 @@ class LaplacianSolver:
     def _laplacian(self, weights: Doubles, pull: Doubles | float) -> Any:
         from scipy.sparse import csr_matrix
 
-        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
+        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
         return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 

@@ -16,11 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Bools, Doubles, Floats, Singles
+from splinecli.maths import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations, LaplacianSolver
-from splinecli.surface.blocks import Blocks
-from splinecli.surface.camera import focal_length
+from splinecli.surface.pixel_grid import Blocks, focal_length
 
 _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and refuses zero vectors
 _FIRST_PRECISION, _LATER_PRECISION = 1e-9, 0.03  # relative residuals of the linear solves

@@ -1,20 +1,27 @@
-"""Triangle meshes of height and depth maps.
+"""Triangle meshes of height and depth maps, and meshes of fewer triangles, whose normal texture keeps the detail.
 
-Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera, coordinates are in
-pixels and the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the
-origin is the camera.
+Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera, coordinates are in pixels
+and the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the origin is the
+camera.
+
+The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser mesh. A viewer
+interpolates the unit normal N and the tangent T of the vertices over a triangle and scales both to unit length. The
+bitangent is B = N x T, which points up in the image. A texel (x, y, z) then stands for the normal x T + y B + z N, and
+its colour is (x + 1) / 2 and so on (glTF 2.0, section 3.9.3).
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.arrays import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import unit
-from splinecli.surface.camera import focal_length, image_points, pixel_rays
+from splinecli.surface.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
+from splinecli.system.machine import import_extra
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,7 @@ class SurfaceMesh:
     uvs: Singles
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
-    # exact. See decimation.py.
+    # exact.
     normal_texture: NDArray[np.uint8] | None = None
     tangents: Singles | None = None  # (V, 3) float32, unit, where there is a normal texture
 
@@ -162,3 +169,191 @@ def _triangles(heights: Doubles, mask: Bools) -> NDArray[np.int32]:
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
+
+
+TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
+LARGE_MAP = 500_000  # pixels from which the triangles of a map are so many that those of blocks are decimated
+_TRIANGLES = 50_000  # at a time
+_OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
+_FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
+_LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
+
+
+def decimated_mesh(
+    depth: Floats,
+    mask: Bools,
+    camera_matrix: Floats | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    *,
+    n_triangles: int,
+    normal_map: Floats,
+    largest_step: float | None = None,
+) -> SurfaceMesh:
+    """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal map.
+
+    Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface simplification using quadric
+    error metrics, SIGGRAPH 1997). A mesh that has no more triangles is returned as it is.
+
+    Args:
+        depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
+        n_triangles: at least 1.
+        normal_map: (H, W, 3), unit on the object, zero outside.
+
+    Raises:
+        UsageError: fast-simplification is not installed, or the largest step is negative.
+        InputError: no triangle is left.
+    """
+    mesh = _mesh_of_blocks(depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step)
+    if mesh is None:
+        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+    if n_triangles >= len(mesh.triangles):
+        return mesh
+    simplify = import_extra("fast_simplification", "mesh").simplify
+    # The thresholds of the library are lengths: give it pixels.
+    pixel = 1 if camera_matrix is None else 1 / focal_length(camera_matrix)
+    vertices, triangles = simplify(mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles)
+    if not len(triangles):
+        raise InputError(f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate")
+    vertices = vertices * pixel
+    normals = vertex_normals(vertices, triangles)
+    tangents = _tangents(vertices, normals, camera_matrix)
+    shape = normal_map.shape[:2]
+    points = image_points(vertices, shape, camera_matrix)
+    return replace(
+        mesh,
+        vertices=vertices.astype(np.float32),
+        triangles=triangles.astype(np.int32),
+        normals=normals.astype(np.float32),
+        uvs=texture_coordinates(points, shape),
+        tangents=tangents.astype(np.float32),
+        normal_texture=_normal_texture(points, triangles, normals, tangents, normal_map),
+    )
+
+
+def _mesh_of_blocks(
+    depth: Floats,
+    mask: Bools,
+    camera_matrix: Floats | None,
+    colours: NDArray[np.uint8] | None,
+    n_triangles: int,
+    normal_map: Floats,
+    largest_step: float | None,
+) -> SurfaceMesh | None:
+    """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
+
+    Collapsing all edges of a large map takes much memory. If far fewer triangles are wanted, those of the blocks, which
+    are at least TRIANGLES_LEFT times as many, have the same shape, and the normal texture keeps the detail.
+    """
+    step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
+    if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
+        return None
+    blocks = Blocks.of_step(mask, step)
+    of_blocks = np.zeros((*blocks.mask.shape, 4))
+    pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
+    of_blocks[blocks.mask] = blocks.average(pixels, mask)
+    # Without a camera, a step counts in blocks, as a pixel does.
+    scale = step if camera_matrix is None else 1
+    mesh = surface_mesh(
+        of_blocks[..., 0] / scale,
+        blocks.mask,
+        blocks.shrink_camera(camera_matrix),
+        normal_map=unit(of_blocks[..., 1:]),
+        largest_step=largest_step,
+    )
+    if len(mesh.triangles) <= n_triangles:
+        return None
+    shift = np.zeros(3)
+    if camera_matrix is None:
+        shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
+    vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
+    texture = None if colours is None else fill_outside(colours, mask)
+    return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
+
+
+def _tangents(vertices: Doubles, normals: Doubles, camera_matrix: Floats | None) -> Doubles:
+    """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row of the image.
+
+    A row of the image shows the plane that contains the viewing rays of the row. This is how viewers compute tangents
+    themselves (MikkTSpace): the derivative of the position along u.
+    """
+    along = np.array((1.0, 0.0, 0.0)) if camera_matrix is None else ray_basis(camera_matrix)[0]
+    rays = np.array((0.0, 0.0, -1.0)) if camera_matrix is None else vertices
+    tangents = unit(np.cross(np.cross(along, rays), normals))
+    tangents[~tangents.any(axis=1)] = unit(along)
+    return tangents
+
+
+def _normal_texture(
+    points: Doubles, triangles: Integers, normals: Doubles, tangents: Doubles, normal_map: Floats
+) -> NDArray[np.uint8]:
+    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
+
+    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals`
+    and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
+    """
+    texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
+    known = np.zeros(normal_map.shape[:2], np.bool_)
+    on_object = np.asarray(normal_map.any(axis=2))
+    for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
+        seen = on_object[rows, columns]
+        corners, weights, rows, columns = triangles[number[seen]], weights[seen], rows[seen], columns[seen]
+        frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
+        texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
+        texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
+        known[rows, columns] = True
+    return fill_outside(texture, known)
+
+
+def _in_frame(measured: Doubles, normals: Doubles, tangents: Doubles) -> Doubles:
+    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be perpendicular to N."""
+    bitangents = np.cross(normals, tangents)
+    along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals))
+    skew = np.einsum("qx,qx->q", tangents, normals)
+    square = np.maximum(1 - skew**2, 1e-6)
+    texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
+    texels[:, 2] = np.maximum(texels[:, 2], _LOWEST)
+    return unit(texels)
+
+
+def _covered_pixels(
+    points: Doubles, triangles: Integers, shape: tuple[int, ...]
+) -> Iterator[tuple[NDArray[np.intp], Doubles, NDArray[np.intp], NDArray[np.intp]]]:
+    """Yield the pixels whose centres lie in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
+    for start in range(0, len(triangles), _TRIANGLES):
+        numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
+        corners = points[triangles[numbers]]
+        forms = _barycentric_forms(corners)
+        seen = np.isfinite(forms).all(axis=(1, 2))
+        numbers, corners, forms = numbers[seen], corners[seen], forms[seen]
+        # The rows of each triangle, and in each row the columns in which all three coordinates are positive.
+        first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
+        last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
+        which, rows = _ranges(first, last)
+        slope, rest = forms[which, :, 0], forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -rest / slope
+        low = np.where(slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)).max(axis=1)
+        high = np.where(slope < 0, crossing, np.inf).min(axis=1)
+        span, columns = _ranges(np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1))
+        which, rows = which[span], rows[span]
+        place = np.stack((columns, rows, np.ones(len(rows))), axis=1)
+        yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
+
+
+def _barycentric_forms(corners: Doubles) -> Doubles:
+    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
+    following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
+    edge = last - following
+    normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
+    area = np.einsum("tcx,tcx->tc", normal, corners - following)
+    area[np.abs(area) < _FLATTEST] = np.nan  # a triangle that covers nothing
+    normal = normal / area[..., None]
+    return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
+
+
+def _ranges(first: Doubles, last: Doubles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the whole numbers from each first to its last, and before them the number of the range of each."""
+    lengths = np.maximum(last - first + 1, 0).astype(np.intp)
+    which = np.repeat(np.arange(len(lengths)), lengths)
+    within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return which, first.astype(np.intp)[which] + within

@@ -1,21 +1,27 @@
 """The files of a surface: meshes as glTF (GLB), PLY, OBJ and STL; depth maps as float32 NPY, TIFF and EXR, and as PNG.
 
-The command line needs the names in this file, so everything heavy is imported in functions.
+The command line needs the names in this file, so everything heavier than NumPy is imported in functions.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
+from splinecli.errors import OutputError
+from splinecli.system.machine import import_extra
+
+if TYPE_CHECKING:
     from splinecli.surface.mesh import SurfaceMesh
     from splinecli.system.publishing import Content
+
 
 SURFACE_FILES = {
     "glb": ("mesh.glb",),
@@ -129,10 +135,6 @@ def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
 
 
 def _encode_exr(surface: Surface) -> bytes:
-    import numpy as np
-
-    from splinecli.system.exr import encode_exr
-
     low = np.nanmin(surface.depth)
     heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)
     return encode_exr(heights, {"unit": surface.unit, "outside": f"{low:.7g}"})
@@ -143,7 +145,6 @@ def _encode_png(surface: Surface) -> bytes:
 
     The text `depth` of the PNG file has these values and their unit.
     """
-    import numpy as np
     from PIL import Image, PngImagePlugin
 
     low, high = float(np.nanmin(surface.depth)), float(np.nanmax(surface.depth))
@@ -167,7 +168,6 @@ _ENCODERS: dict[str, Callable[[Surface], Content]] = {
 
 
 def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
-    import numpy as np
     import trimesh
 
     return trimesh.Trimesh(
@@ -193,8 +193,6 @@ def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
 
     Without them, viewers derive their own tangents in different ways.
     """
-    import numpy as np
-
     tangents = mesh.tangents
     if tangents is None:
         return None
@@ -212,3 +210,28 @@ def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
         buffers["tangents"] = np.insert(tangents, 3, 1, axis=1).astype("<f4").tobytes()
 
     return add
+
+
+def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:
+    """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its header.
+
+    The map is (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these names. Raises
+    UsageError if OpenEXR is not installed, or OutputError if the folder for temporary files cannot be written.
+    """
+    library = import_extra("OpenEXR", "exr")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage, **attributes}
+    channels = {"Y" if pixels.ndim == 2 else "RGB": np.ascontiguousarray(pixels)}
+    # The library writes files only.
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "map.exr"
+        try:
+            library.File(header, channels).write(str(path))
+            return path.read_bytes()
+        except (OSError, RuntimeError) as error:
+            raise OutputError(f"cannot be written ({error})", path=path) from error
+
+
+def check_exr(formats: Sequence[str]) -> None:
+    """Raise UsageError, before the work, if EXR files are to be written and the library is not installed."""
+    if "exr" in formats:
+        import_extra("OpenEXR", "exr")

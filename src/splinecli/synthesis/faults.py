@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.maths.transfer import decode_transfer
+from splinecli.restoration.images import restore_saturated
 from splinecli.synthesis.random_numbers import draw_uniform
 
 DARK_SHARE = 0.4

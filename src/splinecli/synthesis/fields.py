@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.system.extras import import_extra
+from splinecli.system.machine import import_extra
 
 Field = Callable[[Floats], Floats]
 

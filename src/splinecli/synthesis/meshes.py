@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
-from splinecli.system.memory import is_out_of_memory
+from splinecli.system.files import check_file
+from splinecli.system.machine import is_out_of_memory
 
 Floats = NDArray[np.floating]
 REACH = 0.94  # half-width of the object in the camera's square

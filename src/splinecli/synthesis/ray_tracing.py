@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.system.extras import import_extra
+from splinecli.system.machine import import_extra
 
 OFFSET = 1e-4
 """Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by

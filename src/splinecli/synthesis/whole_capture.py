@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.restoration.images import restore_saturated
 from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth, photograph
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.faults import (

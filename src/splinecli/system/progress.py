@@ -1,5 +1,65 @@
-"""How a long computation tells its progress."""
+"""What a long computation reports: pixels that are done, messages, stages and their seconds."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
 
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
+
+STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
+"""The stages, in their order, but for page.html: it is one of the pictures, and comes after the surface."""
+
+
+class Clock:
+    """Adds up the seconds of stages, each of which ends where the next one begins. The first is reading."""
+
+    def __init__(self) -> None:
+        self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._stage, self._since = STAGES[0], time.perf_counter()
+
+    def begin(self, stage: str) -> None:
+        """End the current stage and begin one of STAGES."""
+        now = time.perf_counter()
+        self._seconds[self._stage] += now - self._since
+        self._stage, self._since = stage, now
+
+    def seconds(self) -> dict[str, float]:
+        """Return the seconds of each stage so far, and of all together as `total`."""
+        self.begin(self._stage)
+        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
+            "total": round(sum(self._seconds.values()), 3)
+        }
+
+
+class Advance(Protocol):
+    """Move the progress of a stage by `amount`; `note` is a short text to show beside it."""
+
+    def __call__(self, amount: float, note: str = "") -> None: ...
+
+
+class Observer:
+    """Receives messages, warnings and progress. This base class ignores them all.
+
+    A subclass overrides what it wants to show.
+    """
+
+    def say(self, message: str) -> None:
+        """Receive a message for the user."""
+
+    def warn(self, message: str) -> None:
+        """Receive a warning: the results may be worse than they could be."""
+
+    def error(self, message: str) -> None:
+        """Receive an error: one of several inputs cannot be used, and the work goes on without it."""
+
+    @contextmanager
+    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
+        """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps.
+
+        `unit` is what the steps are, such as pixels, where their number in a second tells something.
+        """
+        yield lambda amount, note="": None
+
+
+SILENT = Observer()

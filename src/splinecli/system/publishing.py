@@ -30,7 +30,6 @@ from splinecli.system.files import (
 )
 
 LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
-_SECONDS_BETWEEN_TRIES = 0.02
 
 
 class BusyError(OutputError):
@@ -93,7 +92,7 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
                 hint="Wait for it to end, or choose another -o",
             )
         if not got:
-            time.sleep(_SECONDS_BETWEEN_TRIES)
+            time.sleep(0.02)
 
 
 def _open_lock(path: Path) -> IO[str]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.formats.text import read_lines
+from splinecli.capture.formats.numbers import read_lines
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.networks.weights import shipped_names
 from splinecli.system.files import expanded, parse_json

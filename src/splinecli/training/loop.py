@@ -18,8 +18,8 @@ from splinecli.errors import ModelError, OutputError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis.random_numbers import stream_seed
-from splinecli.system.devices import choose_device, choose_precision, use_available_cores
 from splinecli.system.files import check_writable, write_text
+from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.publishing import held_folder
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, read_checkpoint_config, save_checkpoint
 from splinecli.training.config import TrainingConfig

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from splinecli.maths.observation_map import cell_directions
-from splinecli.networks.error_head import error_negative_log_likelihood
+from splinecli.networks.li_ne_net import error_negative_log_likelihood
 from splinecli.networks.spline_net import PixelMaps, Rotation, SplineNet, to_pixel_frame
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import Norm, TrainingConfig

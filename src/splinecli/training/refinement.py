@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from splinecli.fits.two_halves import alternating_signs
+from splinecli.fits.least_squares import alternating_signs
 from splinecli.inference import estimate_pixels
-from splinecli.light.indirect_light import IndirectLight
-from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
-from splinecli.methods.networks import NetworkEstimator
-from splinecli.networks.error_head import error_negative_log_likelihood
-from splinecli.networks.refine_channels import channels, split_features
+from splinecli.lights.indirect_light import IndirectLight
+from splinecli.lights.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.methods.batched import NetworkEstimator
+from splinecli.networks.li_ne_net import error_negative_log_likelihood
+from splinecli.networks.refine_net import channels, split_features
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.pixel_sets.store import Entry, PixelSet

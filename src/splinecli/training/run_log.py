@@ -6,13 +6,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.layouts.result_names import CURVES, TRAINING_MAPS
+from splinecli.capture.files import CURVES, TRAINING_MAPS
 from splinecli.errors import OutputError
-from splinecli.pictures.observation_maps import observation_map_figure
-from splinecli.pictures.plotting import png_bytes
-from splinecli.pictures.training_curves import training_figure
-from splinecli.system.extras import import_extra
+from splinecli.pictures.plots import observation_map_figure, png_bytes, training_figure
 from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
+from splinecli.system.machine import import_extra
 from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.tasks import SampleMaps

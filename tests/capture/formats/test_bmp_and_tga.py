@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from scenes import ring_lights, write_capture
-from splinecli.capture import capture_warnings, read_capture
+from splinecli import capture_warnings
+from splinecli.capture import read_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError

@@ -8,8 +8,7 @@ from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
 from splinecli.capture import open_capture
-from splinecli.capture.formats.exif import UPRIGHT, Exposure, common_orientation, find_exposure
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_facts
 from splinecli.errors import InputError
 
 EXIF = 0x8769

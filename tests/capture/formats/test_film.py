@@ -16,7 +16,7 @@ from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.film import FEWEST_FRAMES, MOST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
-from splinecli.pictures.png import encode_png
+from splinecli.pictures.maps import encode_png
 
 SIZE = 96
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from capture.conftest import WriteImage
 from splinecli.capture import read_normal_map
-from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.normal_files import read_ground_truth
+from splinecli.capture.formats.numbers import read_mat
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, encode_picture, unit
 

@@ -11,10 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.formats.exif import Exposure, find_exposure
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.files import AMBIENT, MASK, find_named, list_images
+from splinecli.capture.formats.facts import Exposure, find_exposure, read_facts
 from splinecli.capture.formats.images import decode_image
-from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named, list_images
 from splinecli.errors import InputError
 
 WHITE = 16383

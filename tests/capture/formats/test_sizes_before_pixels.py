@@ -16,13 +16,12 @@ from scipy.io import savemat
 
 from scenes import png_chunk
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
-from splinecli.calibration.gray import measure_light_intensities
+from splinecli.calibration.lamps import measure_light_intensities
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
-from splinecli.capture.formats.images import decode_image, read_mask
+from splinecli.capture.formats.images import ExpectedSize, check_stored_size, decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
-from splinecli.capture.lights.light_files import read_light_directions
+from splinecli.capture.light_files import read_light_directions
 from splinecli.errors import InputError
 from splinecli.pipeline.info import describe_capture
 
@@ -164,7 +163,7 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path: Path, monkeyp
     np.savetxt(tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)])
     for number in range(6):
         write_claim(tmp_path / f"{number}.png", 19_000, 19_000)
-    monkeypatch.setattr("splinecli.capture.formats.image_size.available_memory", lambda: 5e9)
+    monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 5e9)
     match = r"6 images of 19000 x 19000 pixels.* take 27\.4 GB of memory, but 5\.0 GB are available"
     refused(lambda: open_capture(tmp_path).read(), match)
     with pytest.raises(InputError, match="3 images of 19000 x 19000 pixels"):
@@ -256,7 +255,7 @@ def test_light_files_with_too_much_text(tmp_path: Path) -> None:
 
 
 def test_the_largest_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splinecli.capture.formats.image_size.LARGEST_IMAGE", 100)
+    monkeypatch.setattr("splinecli.capture.formats.images.LARGEST_IMAGE", 100)
     for name, size in (("small.png", (10, 10)), ("large.png", (10, 11))):
         cv2.imwrite(str(tmp_path / name), np.ones(size, np.uint8))
     assert decode_image(tmp_path / "small.png").shape == (10, 10, 1)
@@ -266,7 +265,7 @@ def test_the_largest_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_an_image_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splinecli.capture.formats.image_size.available_memory", lambda: 1e9)
+    monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 1e9)
     check_stored_size((10_000, 10_000), 1, Path("a.png"))
     with pytest.raises(InputError, match=r"takes 1\.5 GB of memory, but 1\.0 GB are available"):
         check_stored_size((10_000, 10_000, 3), 1, Path("a.png"))

@@ -6,25 +6,32 @@ the EXIF tags, and tifffile the tags of TIFF.
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
-from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_curve
-from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
-from splinecli.capture.formats.raw import RAW_SUFFIXES, raw_size
-from splinecli.capture.formats.tiff import first_page
-from splinecli.capture.paths import check_file, reading
+from splinecli.capture.formats.decoders import (
+    COPY_AGAIN,
+    DAMAGED,
+    RAW_SUFFIXES,
+    damage_as_input_error,
+    first_page,
+    raw_size,
+    read_shot,
+)
 from splinecli.errors import InputError
-from splinecli.maths.transfer import BT709, SRGB, TransferCurve
+from splinecli.maths.transfer import BT709, LARGEST_PROFILE, SRGB, TransferCurve, profile_curve
+from splinecli.system.files import check_file, reading
 
 if TYPE_CHECKING:
     from PIL import Image
+
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -36,7 +43,7 @@ StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as store
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
-"""EXIF tags of the exposure and of the focal length; see exif.py and calibration/view.py."""
+"""EXIF tags of the exposure and of the focal length; see Exposure and calibration/balls.py."""
 
 _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF and DNG
 
@@ -280,3 +287,66 @@ def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
         except Exception:  # damaged tags cause a dozen types of errors; decoding names the damage
             pass
     return found
+
+
+UPRIGHT = 1  # orientation of images that are shown as they are stored
+_SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
+_EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
+
+
+class Exposure(NamedTuple):
+    """Exposure time in seconds, f-number and ISO sensitivity."""
+
+    seconds: float
+    f_number: float
+    iso: float
+
+    @property
+    def relative(self) -> float:
+        """A number that the brightness of the image is proportional to."""
+        return self.seconds * self.iso / self.f_number**2
+
+    def __str__(self) -> str:
+        time = f"1/{1 / self.seconds:.0f}" if self.seconds < 0.3 else f"{self.seconds:g}"
+        return f"{time} s, f/{self.f_number:g}, ISO {self.iso:.0f}"
+
+
+def find_exposure(facts: ImageFacts) -> Exposure | None:
+    """Return the exposure of an image; None where a part of it is missing or the file is damaged."""
+    try:
+        if facts.exif is None and facts.kind == "RAW":
+            numbers: tuple[Any, ...] = read_shot(facts.path)
+        else:
+            numbers = tuple((facts.exif or {})[tag] for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
+        # Some cameras give two ISO numbers.
+        exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
+    except Exception:  # damaged tags cause a dozen types of errors
+        return None
+    return exposure if all(0 < value < math.inf for value in exposure) else None
+
+
+def check_exposures(images: Sequence[ImageFacts]) -> None:
+    """Raise InputError where two images state different exposures."""
+    found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
+    for facts, exposure in found[1:]:
+        first, expected = found[0]
+        if abs(exposure.relative / expected.relative - 1) > _SAME:
+            hint = "Expose all images alike, or give each image's exposure as the intensity of its light"
+            problem = f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
+            raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
+
+
+def common_orientation(images: Sequence[ImageFacts]) -> int:
+    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT where they state none.
+
+    RAW files are not asked: their pixels are read as the sensor has them. Raises InputError for two images with
+    different ones, whose pixels do not fit on each other.
+    """
+    asked = [facts for facts in images if facts.kind != "RAW"]
+    stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)
+    orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
+    for facts, orientation in zip(asked, orientations, strict=True):
+        if orientation != orientations[0]:
+            problem = f"found EXIF orientation {orientation}, expected {orientations[0]} as in {asked[0].path.name}"
+            raise InputError(problem, path=facts.path, hint="Export all images the same way up, without this tag")
+    return orientations[0] if orientations else UPRIGHT

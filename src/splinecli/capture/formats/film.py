@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
-from splinecli.capture.formats.image_size import check_stored_size
-from splinecli.capture.paths import check_file, is_folder
+from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
+from splinecli.capture.formats.images import check_stored_size
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Singles
+from splinecli.maths import Singles
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
-from splinecli.system.files import utf8_name
+from splinecli.system.files import check_file, is_folder, utf8_name
 
 if TYPE_CHECKING:
     import cv2

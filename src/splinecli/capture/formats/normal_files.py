@@ -18,18 +18,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
+from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
-from splinecli.capture.formats.images import cut_out, decode_image, decode_with_alpha, read_mask
-from splinecli.capture.formats.matlab import read_mat
-from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
-from splinecli.capture.paths import StrPath, check_file
+from splinecli.capture.formats.images import (
+    ExpectedSize,
+    check_stored_size,
+    check_vectors,
+    cut_out,
+    decode_image,
+    decode_with_alpha,
+    read_mask,
+)
+from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
 from splinecli.errors import InputError
-from splinecli.maths.arrays import Array, Bools, Doubles, Singles
+from splinecli.maths import Array, Bools, Doubles, Singles
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
-from splinecli.system.extras import import_extra
-from splinecli.system.files import utf8_name
+from splinecli.system.files import StrPath, check_file, utf8_name
+from splinecli.system.machine import import_extra
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")  # of a depth
 _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff")

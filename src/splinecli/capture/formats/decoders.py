@@ -1,0 +1,257 @@
+"""Decoders of TIFF and of camera RAW files, and what all decoders raise for damaged ones."""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError, SplinecliError
+from splinecli.maths import Array
+from splinecli.system.files import utf8_name
+from splinecli.system.machine import import_extra, is_out_of_memory
+
+if TYPE_CHECKING:
+    import rawpy
+
+
+DAMAGED, COPY_AGAIN = "the image is damaged and cannot be read", "Copy or export it again"
+"""Problem and hint for a damaged image."""
+
+
+@contextmanager
+def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> Iterator[None]:
+    """Turn whatever a reader raises for a damaged file, one of a dozen types, into an InputError."""
+    try:
+        yield
+    except SplinecliError:
+        raise
+    except PermissionError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise InputError(problem, path=path, hint=hint) from error
+
+
+_STDERR_LOCK = threading.Lock()
+
+
+@contextmanager
+def native_stderr() -> Iterator[list[str]]:
+    """Catch what C libraries print to stderr; after the block, the list contains it.
+
+    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
+    around decoding. What other threads print meanwhile is lost, unless they print elsewhere: see stderr_is_apart.
+    """
+    messages: list[str] = []
+    with _STDERR_LOCK, tempfile.TemporaryFile() as store:
+        try:
+            if sys.stderr is not None:
+                sys.stderr.flush()
+            original = os.dup(2)
+        except (OSError, ValueError):  # there is no stderr to protect
+            yield messages
+            return
+        try:
+            os.dup2(store.fileno(), 2)
+            yield messages
+        finally:
+            os.dup2(original, 2)
+            os.close(original)
+            store.seek(0)
+            messages.append(store.read(1 << 16).decode(errors="replace"))
+
+
+def stderr_is_apart() -> bool:
+    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while native_stderr catches."""
+    try:
+        return sys.stderr is None or sys.stderr.fileno() != 2
+    except (OSError, ValueError):  # a stream without a descriptor
+        return True
+
+
+_LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
+_LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture
+
+_LONGEST_TAG = 1 << 24  # values, such as the bytes of a colour profile
+_MOST_PARTS = 1 << 18  # strips or tiles
+_PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or tile
+
+# Values of TIFF's PhotometricInterpretation, the meaning of a sample.
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
+
+
+def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
+    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one that OpenCV decodes.
+
+    Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
+    every sample format, but has no decoder for some compressions (LZW).
+
+    Raises:
+        InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
+    """
+    with first_page(file, path) as page:
+        _check_complete(page, os.fstat(file.fileno()).st_size, path)
+        photometric = int(page.photometric)
+        if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
+            problem = f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            raise InputError(problem, path=path, hint="Export it as RGB")
+        pixels = _decode_page(page)
+        if photometric == _WHITE_IS_ZERO:
+            if pixels is None:
+                raise ValueError  # OpenCV would not invert the values
+            if pixels.dtype.kind in "ub":
+                return ~pixels
+    return pixels
+
+
+@contextmanager
+def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
+    """Yield the first page of an open TIFF file. What tifffile raises for a damaged file becomes an InputError."""
+    import tifffile
+
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True  # the error says what a user needs
+    try:
+        with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
+            _check_tags(file)
+            file.seek(0)
+            with tifffile.TiffFile(file, name=path.name) as pages:
+                yield pages.pages.first
+    finally:
+        logger.disabled = before
+
+
+def _check_tags(file: BinaryIO) -> None:
+    """Raise ValueError for a tag with millions of values, because tifffile reads tags as a whole."""
+    start = file.read(16)
+    order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
+    big = 43 in start[2:4]  # BigTIFF has wider numbers
+    number, length, entry = (8, 8, 20) if big else (4, 2, 12)
+    file.seek(int.from_bytes(start[8:16] if big else start[4:8], order))
+    count = int.from_bytes(file.read(length), order)
+    entries = file.read(min(count, 1 << 16) * entry)
+    for place in range(0, len(entries), entry):
+        tag = int.from_bytes(entries[place : place + 2], order)
+        values = int.from_bytes(entries[place + 4 : place + 4 + number], order)
+        if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
+            raise ValueError
+
+
+def _decode_page(page: Any) -> Array | None:
+    """Return pixels (H, W) or (H, W, samples); None where tifffile has no decoder or fails."""
+    if int(page.photometric) == _YCBCR:
+        return None
+    try:
+        pixels: Array = page.asarray()
+    except Exception as error:  # the type of the error for a missing codec depends on tifffile's version
+        if is_out_of_memory(error):
+            raise
+        return None
+    if page.axes == "SYX":
+        pixels = np.moveaxis(pixels, 0, -1)
+    return pixels if pixels.ndim in (2, 3) else None
+
+
+def _check_complete(page: Any, size: int, path: Path) -> None:
+    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels."""
+    # Such a part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture.
+    expanded = math.prod(page.chunks) * page.dtype.itemsize
+    longest = 2 * expanded + _LONGEST_EMPTY_PART
+    if expanded > 2 * page.nbytes + _LARGEST_EMPTY_PART or max(page.databytecounts, default=0) > longest:
+        raise ValueError
+    parts = zip(page.dataoffsets, page.databytecounts, strict=True)
+    if any(count == 0 or offset + count > size for offset, count in parts):
+        raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
+
+
+RAW_SUFFIXES = (
+    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
+    ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
+)  # fmt: skip
+"""RAW files count by their names, because the content of many looks like TIFF."""
+
+
+def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
+    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
+    with _libraw(path) as rawpy, path.open("rb") as file, native_stderr(), rawpy.imread(utf8_name(path, file)) as raw:
+        return (raw.sizes.height, raw.sizes.width, 3), 2
+
+
+def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
+    """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
+
+    They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
+    camera at one setting have the same scale. An orientation is ignored, as in all images.
+
+    Raises:
+        InputError: rawpy is not installed, or LibRaw cannot read the file.
+    """
+    with _libraw(path) as rawpy:
+        with native_stderr():  # not longer, because it stops progress bars, too
+            raw = rawpy.imread(io.BytesIO(content))
+            raw.unpack()
+        with raw:
+            pixels = raw.postprocess(
+                output_color=rawpy.ColorSpace.raw,
+                output_bps=16,
+                gamma=(1, 1),
+                # Other white balances differ between images, or bring red and blue to full scale before saturation.
+                user_wb=[1, 1, 1, 1],
+                no_auto_bright=True,
+                user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
+                highlight_mode=rawpy.HighlightMode.Clip,
+                user_flip=0,
+                # Others interpolate differently under each light: normals of textured objects have two to three
+                # times the error (AHD 1.4 degrees, LINEAR 0.5), those of uniform objects half of it (0.2, 0.4).
+                demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
+            )
+    # Some sensors have four colours. The fourth must not become an alpha channel.
+    return np.asarray(pixels[:, :, :3], np.uint16)
+
+
+def read_shot(path: Path) -> tuple[float, float, float]:
+    """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does not state it.
+
+    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. Raises InputError.
+    """
+    with _libraw(path) as rawpy, native_stderr(), rawpy.imread(io.BytesIO(path.read_bytes())) as raw:
+        return raw.other.shutter_speed, raw.other.aperture, raw.other.iso_speed
+
+
+def _full_scale(raw: rawpy.RawPy) -> int:
+    """Return the value above black from which a photosite counts as saturated."""
+    white = raw.white_level
+    # LibRaw gives the largest number. Many sensors saturate below it, and some files state the level. A level far from
+    # the largest number is in another unit.
+    stated = raw.camera_white_level_per_channel
+    if stated is not None and white / 2 <= min(stated) <= white:
+        white = min(stated)
+    # The black levels of the colours differ a little, and the colour with the highest must reach full scale, too. It is
+    # one less because LibRaw drops decimals after scaling: otherwise every seventh white level would end at 65534.
+    return max(white - max(raw.black_level_per_channel) - 1, 1)
+
+
+@contextmanager
+def _libraw(path: Path) -> Iterator[ModuleType]:
+    """Yield rawpy. What it raises for a damaged file becomes an InputError."""
+    otherwise = "export the photographs as 16-bit linear TIFF"
+    rawpy = import_extra("rawpy", "raw", error=InputError, path=path, otherwise=otherwise)
+    try:
+        yield rawpy
+    except (rawpy.LibRawError, OSError):
+        problem = "the RAW file is damaged or of a camera that LibRaw does not know"
+        raise InputError(problem, path=path, hint=f"Copy it again, or {otherwise}") from None

@@ -1,0 +1,286 @@
+"""Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in turn.
+
+The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds share. As published,
+PRPS/<object> contains images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse, each with one image
+for each line of the object's light.txt: 00000.tif and so on. A capture is one such folder.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from splinecli.capture.files import (
+    FILENAMES,
+    GROUND_TRUTH,
+    LIGHT_DIRECTIONS,
+    LIGHT_FILES,
+    LIGHT_INTENSITIES,
+    MASK,
+    NO_OVERRIDES,
+    NOT_PHOTOGRAPHS,
+    CaptureFiles,
+    NoImagesError,
+    Overrides,
+    check_not_empty,
+    find_images,
+    find_lights,
+    find_named,
+    folder_name,
+    list_folder,
+    list_images,
+)
+from splinecli.capture.formats.film import is_film
+from splinecli.capture.light_files import read_light_directions
+from splinecli.errors import InputError
+from splinecli.system.files import StrPath, is_folder, resolve
+
+TREES = ("PRPS", "PRPS_Diffuse")  # folders of objects in the published tree
+
+_PREFIX = "images_"
+_LIGHTS = "light.txt"
+_BOUNDARIES = ("inboundary.png", "onboundary.png")
+_MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
+# Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
+_ENOUGH_MARKS = 2
+_NUMBERED = re.compile(r"\d{5}\.tif")
+
+
+def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
+
+    Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
+    """
+    captures = list_cyclesps(folder)
+    if captures is None:
+        return None
+    if not captures:
+        expected = f"{_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse"
+        raise InputError(f"found no folder of images, expected {expected}", path=folder)
+    images_folder, *more = captures
+    if more:
+        names = ", ".join(path.name for path in captures)
+        problem = f"found {len(captures)} folders of images ({names}), expected one"
+        raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
+    holder = _parent(images_folder)
+    lights = overrides.lights or find_named(holder, [_LIGHTS])
+    if lights is None:
+        problem = f"found no {_LIGHTS}, expected the light directions of {images_folder.name}"
+        raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
+    return CaptureFiles(
+        "CyclesPS",
+        _name(images_folder),
+        holder,
+        _list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        lights,
+        light_intensities=overrides.intensities,
+        mask=overrides.mask,
+        boundaries=() if overrides.mask else _find_boundaries(holder),
+        ground_truth=overrides.ground_truth or find_named(holder, GROUND_TRUTH),
+    )
+
+
+def cyclesps_name(folder: Path) -> str | None:
+    """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
+    try:
+        captures = list_cyclesps(folder) if is_folder(folder) else None
+    except InputError:  # reading the capture will raise it again
+        return None
+    return _name(captures[0]) if captures and len(captures) == 1 else None
+
+
+def list_cyclesps(folder: Path) -> list[Path] | None:
+    """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
+    is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
+    if not (is_images_folder or _has_marks(folder)) or find_named(folder, LIGHT_DIRECTIONS) is not None:
+        return None  # a light file of its own makes it a plain folder
+    if is_images_folder:
+        return [folder]
+    captures = [entry for entry in list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    # Images beside light.txt are a plain folder, to be used with --lights light.txt.
+    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
+    return None if not captures and list_images(folder, leave_out_stems=no_photographs) else captures
+
+
+def _name(images_folder: Path) -> str:
+    return f"{folder_name(_parent(images_folder))}_{folder_name(images_folder).removeprefix(_PREFIX)}"
+
+
+def _has_marks(folder: Path) -> bool:
+    marked = [entry for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
+    return len({entry.name.lower() for entry in marked}) >= _ENOUGH_MARKS
+
+
+def _parent(folder: Path) -> Path:
+    # "." and ".." are their own parents to pathlib.
+    return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
+
+
+def _find_boundaries(holder: Path) -> tuple[Path, ...]:
+    """Return both masks. The object is their union, so one alone would be wrong."""
+    found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
+    missing = [name for name, path in found.items() if path is None]
+    if missing:
+        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(problem, path=holder, hint="Pass --mask FILE")
+    return tuple(path for path in found.values() if path is not None)
+
+
+def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
+    """Return the images 00000.tif and so on, one for each light."""
+    there = {entry.name.lower(): entry for entry in list_folder(folder)}
+    wanted = [f"{index:05}.tif" for index in range(n_lights)]
+    expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
+    for name in wanted:
+        if name not in there:
+            raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
+    n_images = sum(bool(_NUMBERED.fullmatch(name)) for name in there)
+    if n_images != n_lights:
+        raise InputError(f"found {n_images} images, expected {expected}", path=folder)
+    return tuple(there[name] for name in wanted)
+
+
+_WORD = re.compile(r"[a-z]+")
+_OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
+"""Words in the names of pictures that other programs leave beside the photographs."""
+
+_MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
+
+
+PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
+"""The names of the light file and of the folder of images, in the layout of PSBox (Y. Xiong)."""
+
+
+def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
+    """Return the files of the capture in the folder. The overrides replace those in the folder.
+
+    Raises InputError where the folder is missing, is a file or contains no images; filenames.txt names an image that
+    does not exist; there is no light file; or a file of the overrides does not exist.
+    """
+    folder = Path(folder)
+    list_folder(folder)  # raises where it is no folder
+    overrides.named()
+    try:
+        # The plain folder comes last, because it takes any folder with images.
+        return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
+    except NoImagesError as error:
+        captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
+        if error.path != folder or not captures:
+            raise
+        hint = f"There are captures in {folder}, such as {captures[0]}: give these"
+        raise InputError(error.problem, path=folder, hint=hint) from None
+
+
+def capture_name(folder: StrPath) -> str:
+    """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
+    folder = Path(folder)
+    return folder.stem if is_film(folder) else cyclesps_name(folder) or folder_name(folder)
+
+
+def find_captures(folder: StrPath) -> list[Path]:
+    """Return the captures of a dataset's folder in natural order; the folder alone where it is a capture itself.
+
+    A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
+    or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
+    captures are found by names of files; reading one may still fail. A subfolder that cannot be listed counts as a
+    capture, so that the caller reports it when it reads it.
+
+    Raises:
+        InputError: the folder is missing, is a file, or contains no capture.
+    """
+    folder = Path(folder)
+    inside = _subfolders(folder)
+    captures = _captures_in(folder) or [capture for path in inside for capture in _captures_below(path)]
+    if captures:
+        return captures
+    deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
+    problem = f"found no capture, expected folders of images with a light file ({LIGHT_FILES})"
+    hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
+    raise InputError(problem, path=folder, hint=hint)
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    return [entry for entry in list_folder(folder) if is_folder(entry)]
+
+
+def _captures_in(folder: Path) -> list[Path]:
+    """Return the folder if it is a capture, or the captures of a CyclesPS object."""
+    if find_lights(folder) is not None:
+        objects = folder / PSBOX_IMAGES
+        is_psbox = is_folder(objects) and find_named(folder, PSBOX_LIGHTS) is not None
+        if find_named(folder, [FILENAMES]) is not None or list_images(
+            objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
+        ):
+            return [folder]
+    return list_cyclesps(folder) or []
+
+
+def _captures_below(folder: Path) -> list[Path]:
+    """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
+    try:
+        if folder.name in TREES:
+            return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
+        return _captures_in(folder)
+    except InputError:
+        return [folder]
+
+
+def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
+    """Return the capture's files. Raises InputError where there are no images or lights, or filenames.txt is wrong.
+
+    A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
+    """
+    images, listed = find_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
+    if listed or len(others) > _MOST_OTHERS * len(images):
+        others = ()
+    images = tuple(image for image in images if image not in others)
+    lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
+    if lights is None and overrides.needs_lights:
+        raise InputError(
+            f"the folder contains {len(images)} images but no light file ({LIGHT_FILES})",
+            path=folder,
+            hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
+            " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
+        )
+    layout, ground_truth = "plain folder", GROUND_TRUTH
+    if listed and find_named(folder, ["light_directions.txt"]) is not None:
+        # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
+        layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
+    return _gather(layout, folder, images, lights, overrides, ground_truth, others)
+
+
+def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+    """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
+    lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
+    objects = folder / PSBOX_IMAGES
+    if lights is None or not is_folder(objects):
+        return None
+    images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    check_not_empty(images, objects)
+    return _gather("PSBox", folder, images, lights, overrides)
+
+
+def _gather(
+    layout: str,
+    folder: Path,
+    images: tuple[Path, ...],
+    lights: Path | None,
+    overrides: Overrides,
+    ground_truth: Sequence[str] = GROUND_TRUTH,
+    others: tuple[Path, ...] = (),
+) -> CaptureFiles:
+    """Return the capture's files: the images, the lights, and what else the folder has.
+
+    Files that the user names come before those of the folder.
+    """
+    return CaptureFiles(
+        layout,
+        folder_name(folder),
+        folder,
+        images,
+        light_directions=lights if overrides.needs_lights else None,
+        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        mask=overrides.mask or find_named(folder, MASK),
+        ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
+        others=others,
+    )

@@ -1,1 +1,0 @@
-"""Which files in a folder make a capture."""

@@ -1,0 +1,344 @@
+"""Rows of light files: vectors and angles, their frames, and matrices that are not text (.npy, .mat, YAML, XML).
+
+Matrices of light files that are not lines of text: NumPy's .npy, MATLAB's .mat, OpenCV's YAML and XML. A file may have
+several matrices. The lights are the only one N x 3 or 3 x N that fits the images.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.numbers import (
+    MOST_TEXT,
+    NumberRows,
+    Row,
+    check_length,
+    parse_rows,
+    read_matrices,
+    read_rows_of_words,
+    read_text,
+    to_number,
+)
+from splinecli.errors import InputError, UsageError
+from splinecli.maths import Doubles
+
+AXIS_WORDS = {
+    "x-right": (0, 1),
+    "x-left": (0, -1),
+    "y-up": (1, 1),
+    "y-down": (1, -1),
+    "z-camera": (2, 1),
+    "z-away": (2, -1),
+}
+"""What --light-frame takes: the axis of the file and the sign with which it enters."""
+
+EXCHANGED = "exchanged"  # word for files whose first column is y and whose second is x
+
+
+@dataclass(frozen=True)
+class LightFrame:
+    """The frame of a light file."""
+
+    signs: tuple[int, int, int] = (1, 1, 1)  # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
+    exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
+
+    @property
+    def matrix(self) -> Doubles:
+        """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the camera."""
+        order = [1, 0, 2] if self.exchanged else [0, 1, 2]
+        return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
+
+    def __str__(self) -> str:
+        """Return the value of --light-frame, such as "x-left,y-down"; only what differs from the usual frame."""
+        words = [EXCHANGED] if self.exchanged else []
+        words += [name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1]
+        return ",".join(words) or "x-right,y-up"
+
+    def describe(self) -> str:
+        """Return words such as "x and y exchanged, y negated"; empty for the usual frame."""
+        negated = " and ".join(axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0)
+        parts = ["x and y exchanged"] if self.exchanged else []
+        if negated:
+            parts.append(f"{negated} negated")
+        return ", ".join(parts)
+
+    def after(self, first: LightFrame) -> LightFrame:
+        """Return the frame that stands for `first` and then this one."""
+        x, y, z = (int(sign) for sign in (self.matrix @ first.matrix).sum(axis=1))
+        return LightFrame((x, y, z), self.exchanged != first.exchanged)
+
+
+USUAL_FRAME = LightFrame()  # x right, y up, z to the camera, as in docs/files-and-frames.md
+
+BOTH_NEGATED = LightFrame((-1, -1, 1))
+
+PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1)))
+"""The eight frames with z to the camera; the usual one first."""
+
+
+def parse_light_frame(text: str | None) -> LightFrame:
+    """Return the frame of a list such as "x-left,y-down,exchanged"; the usual one of None.
+
+    Axes that the list does not name are as usual. Raises UsageError for an unknown word, and an axis that comes twice.
+    """
+    if text is None:
+        return USUAL_FRAME
+    signs: dict[int, int] = {}
+    exchanged = False
+    for word in (item.strip() for item in text.split(",")):
+        if word == EXCHANGED:
+            exchanged = True
+            continue
+        if word not in AXIS_WORDS:
+            words = ", ".join((*AXIS_WORDS, EXCHANGED))
+            raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
+        axis, sign = AXIS_WORDS[word]
+        if axis in signs:
+            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} comes twice", hint="Leave one out")
+        signs[axis] = sign
+    return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
+
+
+LightForm = Literal["xyz", "azel", "slant-tilt"]
+"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
+
+RowForm = LightForm | Literal["positions"]  # numbers of a row in a file of lights or of near lamps
+
+COLUMNS: dict[RowForm, dict[int, str]] = {
+    "xyz": {3: "x y z"},
+    "azel": {2: "azimuth elevation"},
+    "slant-tilt": {2: "slant tilt"},
+    "positions": {3: "x y z"},
+}
+"""The number of columns of each form, and their meaning."""
+
+_ZENITH = ("zen", "polar", "incl", "colat", "coelev")
+
+AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
+
+
+def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:
+    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
+
+    Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
+    slant from the camera axis.
+    """
+    azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
+    level = np.cos(elevation)
+    return np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
+
+
+def _azimuth_elevation(row: Sequence[float], form: RowForm) -> tuple[float, float]:
+    first, second = row[-2:]
+    return (second, 90 - first) if form == "slant-tilt" else (first, second)
+
+
+def check_angles(table: NumberRows, form: RowForm) -> None:
+    """Raise InputError, with the line, for rows whose last two columns are no such angles."""
+    for row in table.rows:
+        first, second = row.numbers[-2:]
+        azimuth, elevation = _azimuth_elevation(row.numbers, form)
+        if not (0 < elevation <= 90 and abs(azimuth) <= 360):
+            if form == "slant-tilt":
+                problem = f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to 360 degrees"
+                hint = "The slant counts from the camera axis"
+            else:
+                problem = f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and above 0 to 90"
+                problem += " degrees"
+                hint = "The elevation counts from the image plane: 90 is the direction of the camera"
+            raise InputError(problem, path=table.path, line=row.line, hint=hint)
+    if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
+        problem = "no angle is above 2 pi, so they look like radians, expected degrees"
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
+
+
+def zenith_as_elevation(light_directions: Doubles) -> Doubles:
+    """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
+    level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
+    across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
+    return np.concatenate((across, level), axis=-1)
+
+
+def lights_of_half_vectors(half_vectors: Doubles) -> Doubles:
+    """Return the lights (..., 3) that a mirror with these unit normals reflects towards the camera."""
+    return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
+
+
+def refuse_angles(table: NumberRows) -> None:
+    """Raise InputError for rows that are plainly angles: two columns, or with a count, or with one radius for all."""
+    rows = [row.numbers for row in table.rows]
+    lengths = {len(row) for row in rows}
+    if len(rows) <= 3 or lengths not in ({2}, {3}):
+        return
+    numbered = lengths == {3} and counts_rows([row[0] for row in rows]) is not None
+    found, hint = "", AZEL_HINT
+    if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
+        found = f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3 columns (x y z)"
+    elif lengths == {3} and not numbered and _have_one_radius(np.array(rows)):
+        found, hint = f"azimuth, elevation and {rows[0][2]:g}, expected x y z", f"Leave the third column out. {hint}"
+    if found:
+        raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
+
+
+def _have_one_radius(rows: Doubles) -> bool:
+    """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
+    azimuth, elevation, radius = rows.T
+    all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
+    return bool(np.ptp(radius) == 0 and all_in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90)
+
+
+def counts_rows(column: list[float]) -> int | None:
+    """Return the first number of a column that counts the rows in some order, 0 or 1; None for any other column."""
+    ordered = sorted(column)
+    return next((first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None)
+
+
+_FOLDERS = re.compile(r"[/\\]")
+_AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
+_ANGLE = re.compile(r"(az|el|alt)")
+_AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
+
+
+def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
+    """Return the rows of a text file, without "#" comments, blank lines and a header (a first row without numbers).
+
+    Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are the light. A header
+    that names them, as "z y x" or "elevation azimuth", gives their order.
+
+    Args:
+        n_numbers: the number of numbers that follow a name.
+
+    Raises:
+        InputError: with the line, for a word that is no finite number; also for a file without rows, and for a header
+            or rows that are plainly other angles than expected.
+    """
+    rows = read_rows_of_words(path, n_numbers, expected=expected)
+    order = list(range(n_numbers))
+    if len(rows) > 1 and all(to_number(word) is None for word in rows[0][2]):
+        line, _, header = rows.pop(0)
+        order = _order_of(header[-n_numbers:])
+        found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+        if found is not None and n_numbers == len(_ANGLES):
+            problem = f'found the column "{found[:40]}", expected azimuth and elevation'
+            hint = "The elevation is 90 minus the angle from the camera axis"
+            raise InputError(problem, path=path, line=line, hint=hint)
+    # A count may stand before rows with names.
+    body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
+    if body and all(to_number(words[0]) is None for *_, words in body):
+        if all(len(words) > n_numbers for *_, words in body):
+            names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
+            without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
+            return replace(_reordered(parse_rows(without_names, path), order), names=names)
+        angles = [words[1:] for *_, words in body if None not in map(to_number, words[1:])]
+        if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [len(_ANGLES)]:
+            problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
+            raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
+    return _reordered(parse_rows(rows, path), order)
+
+
+def _order_of(header: list[str]) -> list[int]:
+    """Return the places of x, y and z, or of azimuth and elevation, in a header; their usual places in any other."""
+    words = [word.lower().strip("\"'") for word in header]
+    for pattern, wanted in ((_AXIS.fullmatch, _AXES), (_ANGLE.match, _ANGLES)):
+        found = [match[1].replace("alt", "el") for word in words if (match := pattern(word))]
+        if len(words) == len(wanted) and sorted(found) == sorted(wanted):
+            return [found.index(name) for name in wanted]
+    return list(range(len(header)))
+
+
+def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
+    first = -len(order)
+
+    def reorder(row: Row) -> Row:
+        last = row.numbers[first:]
+        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order))) if len(last) == -first else row
+
+    return replace(table, rows=tuple(map(reorder, table.rows)))
+
+
+def image_name(text: str, numbers: list[str]) -> str:
+    """Return what stands before the last numbers of a row, without folders, quotes and separators."""
+    for word in reversed(numbers):
+        text = text.rstrip(" \t,;")[: -len(word)]
+    return _FOLDERS.split(text.strip(" \t,;\"'"))[-1]
+
+
+ARRAY_SUFFIXES = (".npy", ".mat", ".yml", ".yaml", ".xml")
+
+# OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
+# No part may run over what another one begins with: a file of 1 MB would take minutes.
+_YAML = re.compile(
+    r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
+    r"\s+data:\s*\[([^][:]*)\]",
+    re.MULTILINE,
+)
+_XML = re.compile(
+    r"<([\w.-]+)\s+type_id=\"opencv-matrix\"\s*>\s*<rows>\s*(\d{1,9})\s*</rows>\s*<cols>\s*(\d{1,9})\s*</cols>"
+    r"\s*<dt>[^<]*</dt>\s*<data>([^<]*)</data>"
+)
+
+
+def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
+    """Return the rows of the matrix of lights, n_images of them if it is known; the lines count them from 1.
+
+    Raises InputError where the file is damaged, or not one alone of its matrices can be the lights.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        array = _read_npy(path)
+    else:
+        check_length(path, MOST_TEXT)
+        array = _choose(read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
+        raise InputError(
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3", path=path
+        )
+    rows = enumerate(array.astype(np.float64).tolist(), start=1)
+    return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
+
+
+def _choose(matrices: Mapping[str, Doubles], path: Path, n_images: int | None) -> Doubles:
+    """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
+    lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
+    if len(lights) > 1:
+        lights = {name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))} or lights
+    if len(lights) == 1:
+        return next(iter(lights.values()))
+    sizes = ", ".join(f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items())
+    problem = f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x N{f': {sizes}' if sizes else ''}"
+    hint = "Write the light directions into a text file, a line x y z for each image"
+    raise InputError(problem, path=path, hint=hint)
+
+
+def _read_npy(path: Path) -> NDArray[np.generic]:
+    check_length(path, MOST_TEXT)
+    try:
+        with path.open("rb") as file:
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
+        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
+
+
+def _read_opencv(path: Path) -> dict[str, Doubles]:
+    """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
+    text = read_text(path).decode(errors="replace")
+    found: dict[str, Doubles] = {}
+    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
+        try:
+            numbers = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
+            found[name] = numbers.reshape(int(rows), int(columns))
+        except ValueError:
+            raise InputError(
+                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}", path=path
+            ) from None
+    return found

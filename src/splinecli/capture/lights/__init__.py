@@ -1,1 +1,0 @@
-"""Light files, and draws of lights."""

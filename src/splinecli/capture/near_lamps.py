@@ -1,0 +1,448 @@
+"""Lamps at arm's length: their positions, the scale that ties pixels to the unit of the positions, their files, and
+whether they can be where their positions say.
+
+The frame is that of light directions: x right, y up, z to the camera. The origin lies on the object's mean plane, at
+the centre of the image. Positions may be in any unit, such as millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.files import LIGHT_POSITIONS, find_lights, find_named, stamp_content
+from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
+from splinecli.capture.light_files import NAMED_SUFFIXES, read_light_positions
+from splinecli.capture.light_rows import ARRAY_SUFFIXES, LightFrame, read_light_rows
+from splinecli.capture.linearise import Window
+from splinecli.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
+from splinecli.errors import InputError, UsageError
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.surface.pixel_grid import ray_basis
+from splinecli.system.files import is_substitution
+
+_LEAST_SHARE = 0.05
+"""Least intensity of a lobe. Observations are divided by it, and so is their noise. Outside, a pixel looks shadowed."""
+
+
+@dataclass(frozen=True, eq=False)
+class NearLamps:
+    """F lamps as points of light, over an image of known scale.
+
+    Raises:
+        InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
+    """
+
+    positions: Doubles  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
+    pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
+    middle: tuple[float, float]  # row and column of the origin, in pixels of what was read
+    # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
+    reference_distances: Doubles
+    camera_matrix: Doubles | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    points: Singles | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
+    # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
+    # is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
+    # lamps that shine alike in all directions
+    lobes: Doubles | None = None
+
+    def __post_init__(self) -> None:
+        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
+            raise InputError(f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)")
+        if (self.positions[:, 2] <= 0).any():
+            raise InputError("a lamp lies behind the object (z <= 0)", hint="z points to the camera")
+        if not 0 < self.pixel_size < np.inf:
+            raise InputError(f"the pixel size is {self.pixel_size:g}, expected a number above 0")
+
+    @classmethod
+    def of(
+        cls,
+        positions: Doubles,
+        pixel_size: float,
+        shape: tuple[int, ...],
+        *,
+        equal: bool,
+        camera_matrix: Doubles | None = None,
+        lobes: Doubles | None = None,
+    ) -> NearLamps:
+        """Return lamps at positions (F, 3) over whole images of this shape (H, W).
+
+        Args:
+            equal: whether the light intensities are unknown, so that all lamps count as equally strong along their
+                axes. Otherwise each intensity holds at the origin, where a gray card would measure it.
+        """
+        distances = np.linalg.norm(positions, axis=1)
+        if equal:
+            distances = np.full_like(distances, distances.mean())
+        elif lobes is not None:
+            distances = distances / np.sqrt(_within_lobes(lobes, positions[None] / distances[:, None])[0])
+        middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
+        return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
+
+    def within(self, left: float, top: float, step: int, camera_matrix: Doubles | None) -> NearLamps:
+        """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
+        middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
+        return replace(self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the lamps as JSON values: their distances from the origin, and the scale."""
+        distances = np.linalg.norm(self.positions, axis=1)
+        return {
+            "distances": distances.round(4).tolist(),
+            "pixel_size": self.pixel_size,
+            "camera": "orthographic" if self.camera_matrix is None else "perspective",
+            "camera_matrix": None if self.camera_matrix is None else self.camera_matrix.tolist(),
+            "lobes": None if self.lobes is None else self.lobes.round(4).tolist(),
+        }
+
+    def turned(self, directions: Doubles) -> NearLamps:
+        """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
+        distances = np.linalg.norm(self.positions, axis=1, keepdims=True)
+        return replace(self, positions=directions * distances)
+
+    def choose_lights(self, positions: Sequence[int]) -> NearLamps:
+        """Return some of the lamps, in the order given."""
+        chosen = list(positions)
+        lobes, distances = None if self.lobes is None else self.lobes[chosen], self.reference_distances[chosen]
+        return replace(self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes)
+
+    def choose_pixels(self, rows: slice | Integers) -> NearLamps:
+        """Return the lamps with the surface in some of the pixels."""
+        return self if self.points is None else replace(self, points=self.points[rows])
+
+    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Doubles:
+        """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
+        middle_row, middle_column = self.middle
+        across, up = columns - middle_column, middle_row - rows
+        return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
+
+    def extent(self, mask: Bools) -> tuple[tuple[float, float], Doubles]:
+        """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on the mean plane."""
+        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
+        return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
+
+    def angles_across_deg(self, mask: Bools) -> Doubles:
+        """Return for each lamp (F,) how far its direction differs, at most, from that at the middle of the object.
+
+        Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
+        """
+        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
+        directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
+        return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
+
+    def light_at(self, points: Floats) -> tuple[Singles, Singles]:
+        """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).
+
+        A strength is the inverse square of the distance, relative to the light at the lamp's reference distance, times
+        the share of the lamp's lobe.
+        """
+        towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
+        distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
+        towards /= distance[..., None]
+        strengths = np.square(self.reference_distances.astype(np.float32) / distance)
+        return towards, strengths if self.lobes is None else strengths * _within_lobes(self.lobes, towards)
+
+
+def _within_lobes(lobes: Doubles, towards: Floats) -> Singles:
+    """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
+    cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
+    return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=_LEAST_SHARE)
+
+
+NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
+
+INSIDE = 0.5
+"""A lamp is refused if its distance from the middle of the object is below this share of the smaller of the object's
+width and height: it would be inside the object, or hide it from the camera."""
+
+CLOSE, FAR = 1.0, 300.0
+"""Distances, in the larger of the object's width and height, that carry a warning: below the first, and above the
+second. A position in metres instead of millimetres changes the distance a thousandfold."""
+
+_SHORTEST_POSITION, _UNEQUAL_LENGTHS = 3.0, 1.02
+"""Vectors of a file of directions are probably positions above this length, if the longest is so much longer."""
+
+UNIT_HINT = (
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the pixel size or object"
+    " width"
+)
+
+
+def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
+    """Warn of lamps that are hardly possible over an object with this mask (H, W), from a file of positions, if any.
+
+    Raises InputError where a lamp would be inside the object, or in front of it.
+    """
+    sizes, middle = lamps.extent(mask)
+    distances = np.linalg.norm(lamps.positions - middle, axis=1)
+    nearest = int(distances.argmin())
+    text = f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is {sizes[0]:.3g} wide"
+    if distances[nearest] < INSIDE * min(sizes):
+        raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
+    if distances[nearest] < CLOSE * max(sizes):
+        return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
+    if distances[nearest] > FAR * max(sizes):
+        return [CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")]
+    return []
+
+
+def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools) -> list[CaptureWarning]:
+    """Warn that lights count as distant over a mask (H, W), although a file has their positions.
+
+    The lamps of the file are None where their scale is unknown.
+    """
+    name = "the lamps' positions" if positions is None else positions.name
+    if lamps is None:
+        text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
+        return [CaptureWarning(NEAR_LAMPS, text)]
+    angle_deg = lamps.angles_across_deg(mask).max()
+    if angle_deg <= NEAR_DEG:
+        return []
+    text = (
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
+        " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
+    )
+    return [CaptureWarning(NEAR_LAMPS, text)]
+
+
+def positions_as_directions(path: Path) -> list[CaptureWarning]:
+    """Warn of a text file of light directions whose vectors have lengths as positions of lamps have."""
+    if path.suffix.lower() in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES) or is_substitution(path):
+        return []
+    try:
+        vectors = read_light_rows(path, expected="x y z", n_numbers=3).as_array()
+    except InputError:
+        return []  # a file of angles
+    vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]
+    lengths = np.hypot.reduce(vectors, axis=1)
+    if len(lengths) < 3 or lengths.min() < _SHORTEST_POSITION or lengths.max() < _UNEQUAL_LENGTHS * lengths.min():
+        return []
+    text = (
+        f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g}, as positions of"
+        " lamps have, but count as directions. If they are positions, use --light-positions."
+    )
+    return [CaptureWarning(NEAR_LAMPS, text)]
+
+
+PIXEL_SIZE = ("pixel_size.txt",)
+CAMERA_MATRIX = ("camera_matrix.txt",)
+LOBES = ("light_lobes.txt",)
+_MOST_NARROW = 100  # the exponent of a lamp that has half of its light 7 degrees off its axis
+
+SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+
+
+class LitSource(Protocol):
+    """What lamps need to know of an opened capture; see CaptureSource."""
+
+    @property
+    def n_lights(self) -> int: ...
+    @property
+    def light_directions(self) -> Doubles: ...
+    @property
+    def light_frame(self) -> LightFrame: ...
+    @property
+    def intensities_measured(self) -> bool: ...
+    @property
+    def window(self) -> Window: ...
+    @property
+    def camera_matrix(self) -> Doubles | None: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class LampOptions:
+    """What the user says about near lamps and the camera. All lengths have the same unit, such as millimetres.
+
+    Raises:
+        UsageError: a number is not above 0, or two options contradict each other.
+    """
+
+    positions: str | None = None  # a file of lamp positions, which replaces the light file
+    distance: float | None = None  # of all lamps from the middle of the object, in their directions
+    pixel_size: float | None = None  # the width of a pixel on the object's mean plane
+    scales_surface: bool = False  # whether the pixel size is given for the surface, so that it needs no lamps
+    object_width: float | None = None  # from the first to the last column of the mask
+    camera_matrix: str | None = None  # a file of the 3 x 3 camera matrix in pixels
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "pixel_size", "object_width"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"the {name.replace('_', ' ')} is {value:g}, expected a number above 0")
+        for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
+            if getattr(self, one) is not None and getattr(self, other) is not None:
+                raise UsageError(f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out")
+        if self.distance is not None and self.pixel_size is None and self.object_width is None:
+            raise UsageError("--light-distance needs the size of a pixel", hint="Add --pixel-size or --object-width")
+
+    @property
+    def given(self) -> str | None:
+        """The first option for lamps alone that is given, as the user writes it; None for none."""
+        names = [name for name in _OPTIONS if not (name == "pixel_size" and self.scales_surface)]
+        return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
+
+
+_FARTHEST = 1e15  # of a lamp. float32 holds the squares of distances up to 1e19
+_OPTIONS = {
+    "positions": "--light-positions",
+    "distance": "--light-distance",
+    "pixel_size": "--pixel-size",
+    "object_width": "--object-width",
+}
+
+NO_LAMP_OPTIONS = LampOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class LampFiles:
+    """What files and options say of near lamps, before the lights and the images are read."""
+
+    positions: Path | None  # the file of positions, or None where `distance` puts the lamps in the light directions
+    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
+    pixel_size: float | None
+    object_width: float | None
+    lobes: Path | None  # the file of the lamps' lobes, or None
+    stamp: tuple[Any, ...]  # of the files that were found, from before they were read
+    used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
+
+    def in_words(self) -> str:
+        """Return the source of the lamps' positions, for people."""
+        if not self.used:
+            return f"{self.positions} is not used"
+        what, width = ("a pixel", self.pixel_size) if self.object_width is None else ("the object", self.object_width)
+        where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
+        return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
+
+    def over(self, source: LitSource, mask: Bools, *, step: int = 1) -> NearLamps | None:
+        """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
+        window, frame, equal = source.window, source.light_frame, not source.intensities_measured
+        if self.positions is not None:
+            positions = read_light_positions(self.positions, source.n_lights, frame)
+        else:
+            assert self.distance is not None
+            positions = source.light_directions * self.distance
+        if (farthest := np.abs(positions).max(initial=0)) > _FARTHEST:
+            raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
+        pixel_size, camera_matrix = self.pixel_size, source.camera_matrix
+        if self.object_width is not None:
+            columns = np.flatnonzero(mask.any(axis=0))
+            pixel_size = self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
+        if pixel_size is None:
+            return None
+        shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
+        lobes = None if self.lobes is None else _read_lobes(self.lobes, positions, frame)
+        lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes)
+        left, top, *_ = window.box or (0, 0)
+        step *= window.step
+        return lamps.within(left, top, step, None if camera_matrix is None else window.camera(camera_matrix))
+
+
+def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
+    """Return what the capture's folder and the options say of near lamps; None for nothing.
+
+    A file of positions in the folder is used, unless the user names a file `lights` of distant lights. Beside such a
+    file, and where nothing tells the scale, positions are found but not used.
+
+    Raises:
+        InputError: a file is wrong, or positions are the only lights and their scale is unknown.
+        UsageError: an option needs positions, and there are none.
+    """
+    positions, used = _find_positions(folder, lights, options)
+    if positions is None and options.distance is None:
+        if options.given is not None:
+            problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
+            raise UsageError(problem, hint="Add --light-positions FILE or --light-distance D, or leave it out")
+        return None
+    folders = [folder, *([] if positions is None else [positions.parent])]
+    scaled = options.pixel_size is not None or options.object_width is not None
+    pixel_file = None if scaled else _find(folders, PIXEL_SIZE)
+    scaled = scaled or pixel_file is not None
+    lobes = _find(folders, LOBES)
+    files = (positions, pixel_file, lobes)
+    stamp = tuple(stamp_content(path) for path in files if path is not None)
+    pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
+    if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
+        raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
+    return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
+
+
+def find_camera(folder: Path, lamps: LampFiles | None, options: LampOptions) -> tuple[Doubles | None, tuple[Any, ...]]:
+    """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
+
+    Raises InputError where the file is wrong.
+    """
+    folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
+    path = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
+    if path is None:
+        return None, ()
+    stamp = stamp_content(path)
+    return read_camera_matrix(path), (stamp,)
+
+
+def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
+    """Return the file of positions, and whether to use positions rather than distant lights."""
+    if options.positions is not None or options.distance is not None:
+        return _path(options.positions), True
+    in_folder = find_named(folder, LIGHT_POSITIONS)
+    if lights is None or in_folder is not None or not lights.is_file():
+        return in_folder, lights is None
+    return find_named(lights.parent, LIGHT_POSITIONS), False
+
+
+def _path(name: str | None) -> Path | None:
+    return None if name is None else Path(name)
+
+
+def read_camera_matrix(path: Path) -> Doubles:
+    """Return the camera matrix (3, 3) of a text file. Raises InputError."""
+    matrix = read_number_rows(path).as_array()
+    if matrix.shape != (3, 3):
+        problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
+        raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
+    ray_basis(matrix)  # refuses other numbers
+    return matrix
+
+
+def _read_lobes(path: Path, positions: Doubles, frame: LightFrame) -> Doubles:
+    """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
+    hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
+    rows = read_number_rows(path).rows
+    if len(rows) not in (1, len(positions)):
+        raise InputError(f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
+    for numbers, line, text in rows:
+        if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= _MOST_NARROW:
+            raise InputError(f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint)
+    rows *= len(positions) // len(rows)
+    lobes = np.array([row.numbers for row in rows])
+    lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
+    away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
+    if away.any():
+        lamp = int(away.argmax())
+        hint = "The directions point from the lamps to the object"
+        raise InputError(f"lamp {lamp + 1} shines away from the object", path=path, line=rows[lamp].line, hint=hint)
+    return lobes
+
+
+def _read_pixel_size(path: Path) -> float:
+    lines = enumerate(read_lines(path, expected="a text file with one number"), start=1)
+    content = [(line, text.partition("#")[0].strip()) for line, text in lines]
+    content = [(line, text) for line, text in content if text] or [(1, "")]
+    line, text = content[0]
+    size = to_number(text) or 0.0
+    if len(content) != 1 or not 0 < size < math.inf:
+        problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
+        hint = "Write the number alone; its unit is that of the lamps' positions"
+        raise InputError(problem, path=path, line=line, hint=hint)
+    return size
+
+
+def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:
+    return next((path for folder in folders if (path := find_named(folder, names)) is not None), None)

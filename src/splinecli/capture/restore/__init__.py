@@ -1,1 +1,0 @@
-"""Restore what the images do not contain: saturated values, light intensities, the mask."""

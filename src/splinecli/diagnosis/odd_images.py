@@ -1,0 +1,330 @@
+"""Images that contradict the others, or are shifted because the camera moved, and a ground truth that does not fit.
+
+One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow fell on it. Each
+image is left out in turn. If what the lights cannot explain nearly vanishes without one of them, and stays without any
+other, this one is odd. So is an image that the factors of rank 3 explain far less well than all others.
+
+The thresholds were chosen on the same captures as those of light_check.py, in which one image was dimmed, exchanged or
+half in shadow, or one light was moved by 40 degrees.
+
+Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see light_fit). So each image
+can be predicted from the others whatever its light, and its fine detail lies where the prediction has it. Where it lies
+elsewhere, the image is shifted: the peak of the normalised cross-correlation tells by how much.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from splinecli import capture_warnings as codes
+from splinecli.capture.light_rows import PLANE_FRAMES, LightFrame
+from splinecli.capture_warnings import CaptureWarning
+from splinecli.diagnosis.summary import Sample
+from splinecli.lights.light_fit import Factors
+from splinecli.lights.rough_normals import rough_normals
+from splinecli.maths import Bools, Doubles, Floats, Singles
+from splinecli.maths.normals import angle_between_deg
+
+MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
+MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness
+
+ODD_MISFIT, OTHER_MISFIT = 0.35, 0.75
+"""Largest misfit without the odd image, and smallest one without any other, as shares of that of all images."""
+
+MIN_RESIDUAL, RESIDUAL_RATIO = 0.25, 2.5
+"""An odd image's residual is above the first, as a share of its brightness, and this many times that of any other."""
+
+MAX_RESIDUAL, MAX_OTHER_RESIDUAL = 0.2, 0.15
+"""Where the factors leave more of all images, as on metals, misfits tell nothing; the second is for residuals, of the
+other images."""
+
+OTHER_BRIGHTNESS = 0.3
+"""Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image."""
+
+
+@dataclass(frozen=True)
+class OddImage:
+    """An image that contradicts the others."""
+
+    place: int
+    left: float  # what is left without it of the misfit, or of the residual of the factors, as a share of that of all
+    # as a share of what its light would give; None where it is not the fault, or the light's intensity is unknown
+    brightness: float | None = None
+
+
+def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | None:
+    """Return the image that contradicts the others under lights (F, 3), or None."""
+    if len(light_directions) < MIN_LIGHTS:
+        return None
+    kinds = [factors] if factors.intensities_known else []
+    for compared in (*kinds, factors.with_free_intensities()):
+        shares = _shares_left(compared, light_directions)
+        first, second = np.argsort(shares)[:2]
+        alone = shares[first] < ODD_MISFIT and shares[second] > OTHER_MISFIT
+        if alone and factors.residual < MAX_RESIDUAL:
+            brightness = _brightness(compared, light_directions, int(first))
+            return OddImage(int(first), float(shares[first]), brightness)
+    residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
+    second, first = np.argsort(residuals)[-2:]
+    left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
+    stands_out = residuals[first] > max(MIN_RESIDUAL, RESIDUAL_RATIO * residuals[second])
+    if stands_out and left < MAX_OTHER_RESIDUAL:
+        return OddImage(int(first), left / factors.residual)
+    return None
+
+
+def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
+    """Return the mean square misfits (F,) without each image, as roots of their shares of that of all images."""
+    n_lights = len(light_directions)
+    misfit = factors.misfits(light_directions[None])[0]
+    if misfit < MIN_MISFIT:
+        return np.ones(n_lights)
+    without = np.repeat(light_directions[None], n_lights, axis=0)
+    diagonal = np.arange(n_lights)
+    without[diagonal, diagonal] = 0  # then all of this image is misfit
+    left = factors.misfits(without) ** 2 - (factors.matrix**2).sum(axis=0)
+    return np.asarray(np.sqrt(np.maximum(left, 0) * n_lights / (n_lights - 1)) / misfit)
+
+
+def _brightness(factors: Factors, light_directions: Doubles, place: int) -> float | None:
+    """Return the brightness of an image as a share of what the others predict; None where it is not only scaled."""
+    if not factors.intensities_known:
+        return None
+    others = np.delete(np.arange(len(light_directions)), place)
+    fit = np.linalg.lstsq(light_directions[others], factors.matrix[:, others].T, rcond=None)[0]
+    predicted, found = light_directions[place] @ fit, factors.matrix[:, place]
+    brightness = float(found @ predicted / max(predicted @ predicted, 1e-12))
+    misfit = np.linalg.norm(found - brightness * predicted) / max(float(np.linalg.norm(found)), 1e-12)
+    return brightness if brightness > 0 and misfit < OTHER_BRIGHTNESS else None
+
+
+LARGEST = 8  # largest shift that is looked for, in pixels of the sample
+
+LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
+"""A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
+images and more, a polished metal reached 0.44 and 0.17."""
+
+LEAST_SHIFT = 0.8  # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
+LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
+LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
+_MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
+_DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
+_LIMIT = 4.0  # of detail, in local contrasts: highlights count no more
+_FAINT = 0.05  # share of the mean contrast below which detail fades out
+
+
+class ImageShift(NamedTuple):
+    """An image whose detail lies `right` pixels to the right and `down` below where the other images have it."""
+
+    place: int
+    right: int
+    down: int
+
+    def __str__(self) -> str:
+        """Return the shift as "2 right 1 up"."""
+        directions = [(self.right, "right", "left"), (self.down, "down", "up")]
+        return " ".join(f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by)
+
+
+def find_shifts(sample: Sample) -> list[ImageShift]:
+    """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
+    values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
+    inner = _inner(sample.mask)
+    if values.shape[1] < LEAST_IMAGES or np.count_nonzero(inner) < LEAST_PIXELS:
+        return []
+    values = values / np.maximum(values.mean(axis=0), 1e-9)
+
+    def shifts_against(predictors: Sequence[int]) -> list[ImageShift]:
+        predicted = enumerate(_predictions(values, predictors))
+        shifts = ((place, _shift(values[:, place], image, sample.mask, inner)) for place, image in predicted)
+        return [ImageShift(place, *(sample.step * by for by in shift)) for place, shift in shifts if shift is not None]
+
+    found = shifts_against(range(values.shape[1]))
+    still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
+    # A shifted image also disturbs the prediction of others.
+    return shifts_against(still) if found and len(still) >= _MIN_PREDICTORS else found
+
+
+def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles]:
+    """Yield for each image of (P, F) what the three strongest factors of the predictors explain of it, (P,)."""
+    products = values.T @ values
+    for place in range(len(products)):
+        others = [other for other in predictors if other != place]  # no image predicts itself
+        strengths, directions = np.linalg.eigh(products[np.ix_(others, others)])
+        weights = np.zeros((len(products), 3), np.float32)
+        weights[others] = directions[:, -3:] / np.sqrt(np.maximum(strengths[-3:], 1e-12))
+        factors = values @ weights
+        yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
+
+
+def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> tuple[int, int] | None:
+    """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images agrees; or None."""
+    detail, expected = _detail(image, mask), _detail(predicted, mask)
+    correlations = _correlations(detail, expected, inner)
+    right, down = _peak(correlations)
+    peak, unmoved = correlations[LARGEST + down, LARGEST + right], correlations[LARGEST, LARGEST]
+    at_edge = max(abs(right), abs(down)) == LARGEST  # the peak may lie beyond
+    if at_edge or peak < LEAST_CORRELATION or peak - unmoved < LEAST_GAIN:
+        return None
+    around = correlations[LARGEST + down - 1 :, LARGEST + right - 1 :][:3, :3]
+    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < LEAST_SHIFT:
+        return None
+    # A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
+    for half in _halves(inner):
+        of_half = _peak(_correlations(detail, expected, half))
+        if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
+            return None
+    return right, down
+
+
+def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles:
+    """Return the correlations of two images (H, W) at shifts down and right from -LARGEST to LARGEST."""
+    import cv2
+
+    most = slice(LARGEST, -LARGEST)
+    template, weights = (np.ascontiguousarray(part[most, most]) for part in (expected, inner))
+    found = cv2.matchTemplate(detail, template, cv2.TM_CCORR_NORMED, mask=weights)
+    return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
+
+
+def _peak(correlations: Singles) -> tuple[int, int]:
+    down, right = np.unravel_index(correlations.argmax(), correlations.shape)
+    return int(right) - LARGEST, int(down) - LARGEST
+
+
+def _halves(inner: Singles) -> Iterator[Singles]:
+    """Yield the left, right, upper and lower half of the pixels of a map (H, W)."""
+    for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
+        yield inner * (places <= middle)
+        yield inner * (places > middle)
+
+
+def _top(before: float, middle: float, after: float) -> float:
+    """Return where the parabola through three values has its top, from the middle one, which is the largest."""
+    return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
+
+
+def _detail(values: Singles, mask: Bools) -> Singles:
+    """Return values (P,) without their blur, over the local contrast, on a map (H, W); zero outside the mask."""
+    import cv2
+
+    inside = mask.astype(np.float32)
+
+    def blur(array: Singles, deviation: float) -> Singles:
+        weight = cv2.GaussianBlur(inside, (0, 0), deviation)
+        return np.asarray(cv2.GaussianBlur(array, (0, 0), deviation) / np.maximum(weight, 1e-3), np.float32)
+
+    image = np.zeros(mask.shape, np.float32)
+    image[mask] = values
+    detail = (image - blur(image, _DETAIL)) * inside
+    contrast = blur(np.abs(detail), _CONTRAST)
+    detail /= contrast + _FAINT * np.abs(detail[mask]).mean() + np.float32(1e-12)
+    return np.asarray(detail.clip(-_LIMIT, _LIMIT), np.float32)
+
+
+def _inner(mask: Bools) -> Singles:
+    """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
+    import cv2
+
+    shifts = np.ones((2 * LARGEST + 1, 2 * LARGEST + 1), np.uint8)
+    return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))
+
+
+MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
+"""A ground truth is in another frame if its median angle to the rough normals is above the first, and another frame
+leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
+
+REACH = 0.15  # the largest shift that is looked for, as a share of the smaller side of the object
+SHIFT_LEFT, SHIFT_FALL_DEG = 0.65, 1.5
+"""A ground truth is shifted if a shift leaves at most this share of the median angle, and takes so much from it. It
+must also leave less than this share of what a rotation leaves: lights that are all tilted turn the normals of a ball
+nearly as a shift does."""
+
+_FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
+_MOST_PIXELS = 4000  # of each comparison
+
+
+def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
+    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame, or when moved.
+
+    It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
+    """
+    if truth is None:
+        return []
+    truth = truth[:: sample.step, :: sample.step]
+    known = sample.mask & truth.any(axis=2)
+    if not known.any():
+        return []
+    normals = rough_normals(sample.observations, light_directions, sample.mask).normals
+    angles = [float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES]
+    best = int(np.argmin(angles))
+    if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
+        return _shifted(normals, truth, sample)
+    frame = _FRAMES[best]
+    code, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
+    if frame.signs[2] < 0:
+        code, lights = codes.GROUND_TRUTH_Z, ""
+    text = (
+        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
+        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
+    )
+    # Either the ground truth or the normals are wrong by this angle.
+    return [CaptureWarning(code, text, angles[0] if code == codes.GROUND_TRUTH_FRAME else None)]
+
+
+def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWarning]:
+    """Warn of a ground truth (h, w, 3) that fits normals (h, w, 3) much better when it is moved."""
+    rows, columns = np.nonzero(sample.mask)
+    reach = max(1, round(REACH * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
+    # Coarse to fine: the angle changes slowly with the shift.
+    right, down, step = 0, 0, max(1, reach // 4)
+    angles: dict[tuple[int, int], tuple[float, float]] = {}
+    while step:
+        around = range(-reach, reach + 1, step) if not angles else range(-step * 2, step * 2 + 1, step)
+        middle = right, down
+        for by_right in around:
+            for by_down in around:
+                moved = middle[0] + by_right, middle[1] + by_down
+                angles.setdefault(moved, _angles_deg(normals, truth, moved))
+        right, down = min(angles, key=lambda moved: angles[moved][0] - angles[moved][1])
+        step //= 2
+    after, before = angles[right, down]
+    if (right, down) == (0, 0) or before - after < SHIFT_FALL_DEG or after > SHIFT_LEFT * before:
+        return []
+    known = normals.any(axis=2) & truth.any(axis=2)
+    if after > SHIFT_LEFT * _rotated_angle_deg(normals[known], truth[known]):
+        return []
+    directions = ((right, "right", "left"), (down, "down", "up"))
+    named = " and ".join(
+        f"{abs(by) * sample.step} pixels {more if by > 0 else less}" for by, more, less in directions if by
+    )
+    text = (
+        f"The ground truth is {before:.1f} degrees from normals that fit the images, but {after:.1f} degrees once"
+        f" a shift of {named} is undone: it is probably shifted against the images, so the errors mean nothing."
+    )
+    return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
+
+
+def _rotated_angle_deg(normals: Doubles, truth: Floats) -> float:
+    """Return the median angle between normals (P, 3) and a truth after the best rotation (Kabsch 1976)."""
+    left, _, right = np.linalg.svd(normals.T @ truth)
+    rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right)))) @ right
+    return float(np.median(angle_between_deg(normals, truth @ rotation.T)))
+
+
+def _angles_deg(normals: Doubles, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:
+    """Return the median angles in degrees between normals and a truth that is moved back, and not moved."""
+    height, width = normals.shape[:2]
+    right, down = shift
+    here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
+    there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
+    moved = truth[there]
+    known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
+    if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
+        return 180.0, 0.0
+    every = slice(None, None, -(-int(np.count_nonzero(known)) // _MOST_PIXELS))
+    own = normals[here][known][every]
+    after, before = (float(np.median(angle_between_deg(own, other[known][every]))) for other in (moved, truth[here]))
+    return after, before

@@ -1,0 +1,283 @@
+"""Figures of evaluations: the error against a setting, and maps and observation maps of single captures.
+
+Plots of the error against the setting in which evaluations differ: the number of lights or the light noise. All
+functions take several evaluations of the same methods. They plot only the captures that all evaluations scored, so that
+every point of an average stands for the same captures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture, open_capture
+from splinecli.errors import UsageError, printable
+from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_in_words
+from splinecli.evaluation.run import draws_for, read_draws_file
+from splinecli.evaluation.tables import AVERAGE, trial_averages
+from splinecli.evaluation.trials import Trial, TrialSource
+from splinecli.inference import estimate_normals
+from splinecli.methods import Estimator
+from splinecli.pictures.plots import method_maps, method_styles, observation_map_figure, png_bytes
+from splinecli.system.files import free_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+MOST_CAPTURES = 4
+"""Number of captures up to which each has a panel. With more, only the average has one, so that it can be read."""
+
+_PANEL_INCHES = (3.2, 2.7)
+_SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
+# matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
+_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
+_NEAREST_TICKS = 0.045  # share of the axis: labels that are closer would overlap
+
+
+def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
+    """Return a PNG of the error against the number of lights K, on a logarithmic axis.
+
+    Each capture has a panel, and so has their average; with one capture, or more than MOST_CAPTURES, there is only the
+    panel of the average. "all" is plotted at the capture's number of lights; in the panel of the average, at the
+    mean number. If the light noise differs too, each of its values has its own dashes.
+    """
+    return _curves(
+        evaluations,
+        x=lambda e, capture: float(np.mean([r.n_lights for r in e.results if capture in (AVERAGE, r.capture)])),
+        tick=lambda e, x: f"{x:.0f}\n(all)" if e.protocol.n_lights is None else f"{x:g}",
+        series=lambda e: f"light noise {e.protocol.light_noise_deg:g} deg",
+        label="number of lights",
+        logarithmic=True,
+    )
+
+
+def light_noise_curves(evaluations: Sequence[Evaluation]) -> bytes:
+    """Return a PNG of the error against the light noise, with the panels of lights_curves.
+
+    Where the number of lights differs too, each number has its own dashes.
+    """
+    return _curves(
+        evaluations,
+        x=lambda e, _: e.protocol.light_noise_deg,
+        tick=lambda _, x: f"{x:g}",
+        series=lambda e: lights_in_words(e.protocol),
+        label="light noise (standard deviation, deg)",
+        logarithmic=False,
+    )
+
+
+def _curves(
+    evaluations: Sequence[Evaluation],
+    *,
+    x: Callable[[Evaluation, str], float],
+    tick: Callable[[Evaluation, float], str],
+    series: Callable[[Evaluation], str],
+    label: str,
+    logarithmic: bool,
+) -> bytes:
+    """Return the panels side by side as PNG, with one curve for each method and series, and one legend for all.
+
+    A curve has a band of one standard deviation to either side. Its colour and marker show the method, its dashes the
+    series. `x` gives an evaluation's place on a capture's x axis, `tick` the label there, `series` the name of its
+    curves.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    common = set.intersection(*(set(evaluation.captures) for evaluation in evaluations))
+    evaluations = [replace(e, results=tuple(r for r in e.results if r.capture in common)) for e in evaluations]
+    captures = evaluations[0].captures
+    shown = [*captures, AVERAGE] if 1 < len(captures) <= MOST_CAPTURES else [AVERAGE]
+    styles = method_styles(evaluations[0].methods)
+    dashes = {name: _DASHES[i % len(_DASHES)] for i, name in enumerate(dict.fromkeys(map(series, evaluations)))}
+    across = 2 if len(shown) == 4 else min(len(shown), 3)
+    down = math.ceil(len(shown) / across)
+
+    figure = Figure(figsize=(_PANEL_INCHES[0] * across, _PANEL_INCHES[1] * down + 0.4), layout="constrained")
+    for capture, axes in zip_longest(shown, figure.subplots(down, across, squeeze=False).flat):
+        if capture is None:
+            axes.set_axis_off()
+            continue
+        in_order = sorted(evaluations, key=lambda e: x(e, capture))
+        for method, style in styles.items():
+            for name, pattern in dashes.items():
+                points = [(x(e, capture), *_error(e, method, capture)) for e in in_order if series(e) == name]
+                place, mae_deg, std_deg = np.array(points).T
+                line = {"color": style.colour, "marker": style.marker, "linestyle": pattern}
+                axes.plot(place, mae_deg, markersize=4, linewidth=1.2, **line)
+                if std_deg.any():
+                    low, high = mae_deg - std_deg, mae_deg + std_deg
+                    axes.fill_between(place, low, high, color=style.colour, alpha=0.2, linewidth=0)
+        _set_ticks(axes, {x(e, capture): tick(e, x(e, capture)) for e in in_order}, logarithmic=logarithmic)
+        average = captures[0] if len(captures) == 1 else f"average of {len(captures)} captures"
+        title = average if capture == AVERAGE else capture
+        axes.set_title(printable(title), fontsize=_LARGE, parse_math=False)
+        axes.set_xlabel(label, fontsize=_SMALL)
+        axes.set_ylabel("mean angular error (deg)", fontsize=_SMALL)
+        axes.set_ylim(bottom=0)
+        axes.tick_params(labelsize=_SMALL)
+        axes.grid(alpha=0.3)
+    handles = [  # a dollar sign would begin a formula
+        Line2D([], [], color=style.colour, marker=style.marker, markersize=4, label=method.replace("$", r"\$"))
+        for method, style in styles.items()
+    ]
+    if len(dashes) > 1:
+        handles += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()]
+    columns = min(len(handles), 2 * across)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=_SMALL)
+    return png_bytes(figure, 200)
+
+
+def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, float]:
+    """Return the mean error of a method on a capture or the average, and its standard deviation over the trials."""
+    if capture == AVERAGE:
+        return evaluation.averages[method], float(np.std(trial_averages(evaluation, method)))
+    result = next(r for r in evaluation.results if (r.method, r.capture) == (method, capture))
+    return result.mae_deg, result.std_deg
+
+
+def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> None:
+    """Set ticks, in rising order, at the points. A label that would overlap the one before it is left out."""
+    from matplotlib.ticker import NullLocator
+
+    if logarithmic:
+        axes.set_xscale("log", base=2)
+    place = {x: math.log2(x) if logarithmic else x for x in ticks}
+    span = max(place.values()) - min(place.values())
+    labels, last = [], -math.inf
+    for x, position in place.items():
+        fits = position - last > _NEAREST_TICKS * span
+        labels.append(ticks[x] if fits else "")
+        last = position if fits else last
+    axes.set_xticks(list(place), labels)
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+SHOWN_PERCENTILES = (10, 50, 90, 99)
+"""Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
+
+MAPS = "_observation_maps"
+MOST_LISTED = 16  # largest number of lights that a title lists
+
+
+class CaptureFigure(NamedTuple):
+    """A picture: the stem of its file name, its caption, and the PNG."""
+
+    stem: str
+    caption: str
+    png: bytes
+
+
+def capture_figures(
+    folder: Path,
+    name: str,
+    stem: str,
+    estimators: Sequence[Estimator],
+    protocol: Protocol,
+    pixels: Sequence[tuple[int, int]],
+    advance: Callable[[float], object],
+) -> list[CaptureFigure]:
+    """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
+
+    Under near lamps, or with a camera matrix, there is none of pixels. All pixels in the mask are estimated, also where
+    the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has
+    no ground truth.
+
+    Args:
+        name: name of the capture in the tables.
+        stem: stem of the figures' file names.
+        pixels: (row, column) of the pixels whose observation maps are shown; for none, those at SHOWN_PERCENTILES.
+        advance: called with the share of the work that was just done.
+    """
+    source = open_capture(folder, white_level=protocol.white_level)
+    read, draws_file = read_draws_file(protocol)
+    trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
+    lights = range(protocol.skipped_lights(name), source.n_lights)
+    steps = 1 + len(estimators)
+    stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps))
+    capture = TrialSource(stored).see(trial)
+    assert capture.ground_truth is not None  # or there is no first trial
+    normals: dict[str, NDArray[np.float32]] = {}
+    errors_deg: dict[str, NDArray[np.float32]] = {}
+    for estimator in estimators:
+        estimate = estimate_normals(
+            capture, estimator, progress=lambda count: advance(count / capture.n_pixels / steps)
+        )
+        assert estimate.error_map_deg is not None
+        normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
+    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= MOST_LISTED else ""
+    title = f"{printable(name)}, {heading(protocol)}{listed}"
+    png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
+    figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
+    network = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
+    # Under near lamps, or before a near camera, each pixel has light directions of its own.
+    if network is not None and capture.lamps is None and capture.camera_matrix is None:
+        whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
+        png = _observation_maps(whole, capture, network, errors_deg[network.name], pixels, title=title)
+        caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
+        figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
+    return figures
+
+
+def has_observation_maps(method: str) -> bool:
+    """Return whether a method has observation maps that figures can show."""
+    return method.startswith("spline-net")
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """Return a different stem of a file name for each capture, also where names have slashes."""
+    stems: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        stem = free_name(name.replace("/", "_"), lambda stem: not taken.isdisjoint((stem, f"{stem}{MAPS}")), "_")
+        taken.update((stem, f"{stem}{MAPS}"))
+        stems.append(stem)
+    return stems
+
+
+def _observation_maps(
+    whole: Capture,
+    capture: Capture,
+    estimator: Estimator,
+    errors_deg: NDArray[np.float32],
+    pixels: Sequence[tuple[int, int]],
+    *,
+    title: str,
+) -> bytes:
+    """Return the figure of some pixels. Raises UsageError for one without ground truth."""
+    from splinecli.methods.batched import NetworkEstimator
+
+    assert isinstance(estimator, NetworkEstimator)
+    for row, column in pixels:
+        inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
+        if not inside or np.isnan(errors_deg[row, column]):
+            raise UsageError(
+                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
+                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
+            )
+    rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
+    if not pixels:
+        order = np.argsort(errors_deg[rows, columns], kind="stable")
+        chosen = [order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES]
+        rows, columns = rows[chosen], columns[chosen]
+    place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
+    sparse, dense, truth = estimator.maps(
+        capture.observations[place], capture.light_directions, whole.observations[place], whole.light_directions
+    )
+    return observation_map_figure(
+        sparse,
+        dense,
+        truth if whole.n_lights > capture.n_lights else None,
+        pixels=np.stack([rows, columns], axis=1),
+        error_deg=errors_deg[rows, columns],
+        title=title,
+        grid=estimator.network.config.grid,
+    )

@@ -1,0 +1,277 @@
+"""Weighted least squares in torch, pixel by pixel, and the methods that repeat it.
+
+Robust Lambertian fit, the starting point of the networks: iteratively reweighted least squares of I = l . b with two
+weights. Observations below 5 % of the pixel's largest are treated as shadows and get a tiny weight. Large residuals get
+smaller weights, which approximates an L1 fit.
+
+Two halves of the lights: random errors differ from light to light, so the halves disagree about them. What all lights
+show alike is either right, or wrong in the same way for all pixels of a neighbourhood.
+
+L1 minimises the sum of absolute residuals, which shadows and highlights affect less than the sum of squares. Trimmed LS
+leaves out shadows, and the darkest and brightest observations.
+
+IW12, robust photometric stereo by sparse Bayesian learning: S. Ikehata, D. Wipf, Y. Matsushita, K. Aizawa, "Robust
+photometric stereo using sparse regression", CVPR 2012, section 3.2, with lambda = 0, as in the authors' own
+comparisons.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from splinecli.fits.robust import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
+from splinecli.maths.observation_map import dot
+
+UNSHADED = 0.6
+"""The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
+observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
+a metal all others are dark beside the highlight."""
+
+FEWEST_LIT = 3  # number of brightest observations that never count as shadows, because a normal needs three
+
+
+def lit_observations(
+    observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = FEWEST_LIT
+) -> Tensor:
+    """Return which observations (P, F) reach `share` of the pixel's quantile UNSHADED or are among its `fewest`
+    largest.
+
+    Args:
+        observations: (P, F), not negative.
+        share: the threshold; 0 takes all observations.
+        valid: (P, F) bool; false ones are not lit. None means all are valid.
+    """
+    if not len(observations):  # an empty batch has no quantile
+        return observations.bool()
+    known = observations if valid is None else observations.masked_fill(~valid, torch.nan)
+    floor = share * known.nanquantile(UNSHADED, dim=1, keepdim=True)
+    there = observations if valid is None else observations.masked_fill(~valid, 0)
+    largest = there.topk(min(fewest, there.shape[1]), dim=1).values[:, -1:]
+    lit = observations >= torch.minimum(floor, largest)
+    return lit if valid is None else lit & valid
+
+
+RIDGE = 1e-12  # Weight of |b|^2. It matters only where the lights of positive weight lie in one plane.
+
+_TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
+
+
+def weighted_least_squares(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return b = C L' W I with C = (L' W L + ridge)^-1, and the diagonal of L C L', which are the variances of L b.
+
+    All arguments are float64, because weights may differ by many orders of magnitude.
+
+    Args:
+        observations, weight: (P, F).
+        light_directions: (F, 3) or (P, F, 3).
+
+    Returns:
+        b (P, 3) and variances (P, F).
+    """
+    x, y, z = light_directions.unbind(-1)
+    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+    ridge = products.new_tensor((RIDGE,) * 3 + (0.0,) * 3)
+    covariance = inverse_3x3((weighted_sum(weight, products) + ridge).unbind(-1), RIDGE)
+    right_side = weighted_sum(weight * observations, light_directions)
+    scaled_normals = torch.stack(multiply_symmetric(covariance, right_side.unbind(-1)), dim=-1)
+    variances = dot(torch.stack(covariance, dim=-1), products * products.new_tensor(_TWICE_OFF_DIAGONAL))
+    return scaled_normals, variances
+
+
+def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:
+    """Return weighted sums (P, K) of directions (F, K) or (P, F, K) with weights (P, F)."""
+    if directions.ndim == 2:
+        return weight @ directions
+    return (weight[:, None] @ directions)[:, 0]
+
+
+LAMBERTIAN_SHADOW_SHARE = 0.05
+LAMBERTIAN_FITS = 5
+_PRIOR = 1e-4
+
+
+def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Return scaled normals b (P, 3) of the robust Lambertian fit: |b| is the albedo, b / |b| the normal.
+
+    Args:
+        observations: (P, F), each pixel scaled to a largest value of 1. A zero pixel gives b = (0, 0, tiny).
+        light_directions: (F, 3) or (P, F, 3), unit.
+        valid: (P, F) bool, all by default.
+    """
+    # A row for each light: sums over lights and the steps below then run along the pixels, three times as fast.
+    observed = observations.T.contiguous()
+    lit = torch.where(observed < LAMBERTIAN_SHADOW_SHARE, 1e-3, 1.0).to(observed)
+    if valid is not None:
+        lit = lit * valid.T
+    x, y, z = light_directions.unbind(-1)
+    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+    # A weak prior towards the last solution keeps pixels with fewer than three lit lights solvable.
+    prior = observed.new_tensor((_PRIOR,) * 3 + (0.0,) * 3)[:, None]
+    solution = observed.new_tensor((0.0, 0.0, 1e-3))[:, None].expand(3, len(observations))
+    weight = lit
+    for iteration in range(LAMBERTIAN_FITS):
+        if iteration:
+            weight = lit / ((_dot(light_directions, solution) - observed).abs() + 0.02)
+        inverse = inverse_3x3((_sum(products, weight) + prior).unbind(), SMALLEST_PIVOT)
+        right_side = _sum(light_directions, weight * observed) + _PRIOR * solution
+        solution = torch.stack(multiply_symmetric(inverse, right_side.unbind()))
+    return solution.T
+
+
+def _sum(directions: Tensor, weight: Tensor) -> Tensor:
+    """Return the sums (K, P) of directions (F, K) or (P, F, K) with weights (F, P)."""
+    return directions.T @ weight if directions.ndim == 2 else weighted_sum(weight.T, directions).T
+
+
+def _dot(directions: Tensor, vectors: Tensor) -> Tensor:
+    """Return the dot products (F, P) of directions (F, K) or (P, F, K) with vectors (K, P)."""
+    return directions @ vectors if directions.ndim == 2 else dot(vectors.T, directions).T
+
+
+_TINY = 1e-9
+
+
+class TwoHalves(NamedTuple):
+    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing."""
+
+    normals: Tensor  # (P, 3), unit, of least squares with all lights
+    # (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a share of
+    # the albedo. On a ring of lights, it is half the difference between the normals of the halves
+    change: Tensor
+    # (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal noise.
+    # Three lights have no residuals, so they do not show it
+    noise: Tensor
+
+
+def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
+    """Fit all lights, and compare two halves of them.
+
+    Args:
+        observations: (P, F) float64, each pixel scaled to a largest value of 1.
+        light_directions: (F, 3) or (P, F, 3) float64, unit.
+        signs: (F,), 1 and -1 for the two halves, the same for all pixels of a capture; see alternating_signs.
+    """
+    gram = light_directions.mT @ light_directions
+    covariance = torch.linalg.inv(gram + RIDGE * torch.eye(3, dtype=gram.dtype, device=gram.device))
+
+    def solve(values: Tensor) -> Tensor:
+        solved: Tensor = weighted_sum(values, light_directions)[:, None] @ covariance
+        return solved[:, 0]
+
+    scaled = solve(observations)
+    albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
+    normals = scaled / albedo
+    signed = (observations - dot(scaled, light_directions)) * signs
+    # The signs have a part that some normal explains, to which residuals are perpendicular. Only the rest sees noise.
+    signs = signs.to(scaled).expand(1 if light_directions.ndim == 2 else len(scaled), -1)
+    seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
+    along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
+    across = covariance.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None] - along
+    noise = signed.sum(dim=-1, keepdim=True) / seeing.clamp(min=_TINY) * across.clamp(min=0).sqrt()
+    return TwoHalves(normals, solve(signed) / albedo, noise / albedo)
+
+
+def alternating_signs(light_directions: Tensor) -> Tensor:
+    """Return 1 and -1 in turn (F,) for lights (F, 3) in the order of their azimuths about the middle one.
+
+    The light furthest from the middle has 1. So neither the order of the lights nor a turn of the image changes the
+    halves, unless two lights have the same direction or distance.
+    """
+    across = light_directions[:, :2] - light_directions[:, :2].mean(dim=0)
+    azimuth = torch.atan2(across[:, 1], across[:, 0])
+    turned = (azimuth - azimuth[across.square().sum(dim=1).argmax()]).remainder(2 * math.pi)
+    place = turned.argsort().argsort()
+    return 1 - 2 * (place % 2).to(light_directions)
+
+
+TRIMMED_SHARE = 0.2
+"""Share of the observations that is left out at each end: with ten lights, the two darkest and the two brightest."""
+
+SHADOW_SHARE = 0.1
+"""Share of the pixel's quantile UNSHADED. Trimmed LS and IW12 leave darker observations out as shadows, as the authors
+of IW12 do."""
+
+FEWEST = 4  # smallest number of observations that stay: one more than a normal and an albedo need
+
+
+def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
+    """Return scaled normals b (P, 3) that minimise |I - L b| over the remaining observations.
+
+    Equal observations are kept or left out together, so the order of the lights does not matter.
+    """
+    count = observations.shape[1]
+    trimmed = max(0, min(int(TRIMMED_SHARE * count), (count - FEWEST) // 2))
+    ordered = observations.sort(dim=1).values
+    darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
+    middling = (observations >= darkest) & (observations <= brightest)
+    weight = lit_observations(observations, SHADOW_SHARE, middling)
+    scaled_normals, _ = weighted_least_squares(observations, light_directions, weight.to(observations.dtype))
+    return scaled_normals
+
+
+L1_FITS = 50
+SMALLEST_RESIDUAL = 1e-7  # weights stop growing below this residual, for a largest observation of 1
+
+
+def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
+    """Return scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
+
+    Iteratively reweighted least squares comes close to the minimum. There, three residuals are zero. So the b of the
+    three smallest residuals is used where it is better.
+    """
+    weight = torch.ones_like(observations)
+    for step in range(L1_FITS):
+        scaled_normals, residual = _fit(observations, light_directions, weight)
+        weight = 1 / residual.clamp(min=max(SMALLEST_RESIDUAL, 0.1 * 0.5**step))
+    three = torch.zeros_like(weight).scatter_(1, weight.topk(3, dim=1).indices, 1.0)
+    vertex, residual_there = _fit(observations, light_directions, three)
+    better = residual_there.sum(dim=1, keepdim=True) < residual.sum(dim=1, keepdim=True)
+    return torch.where(better, vertex, scaled_normals)
+
+
+def _fit(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    scaled_normals, _ = weighted_least_squares(observations, light_directions, weight)
+    return scaled_normals, (observations - dot(scaled_normals, light_directions)).abs()
+
+
+SMALLEST_VARIANCE = 1e-6
+"""Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best."""
+
+IW12_ROUNDS = (
+    20  # further iterations change the normals of real captures by only some hundredths of a degree on average
+)
+
+
+def solve_iw12(
+    observations: Tensor,
+    light_directions: Tensor,
+    valid: Tensor | None = None,
+    *,
+    shadow_share: float = SHADOW_SHARE,
+    iterations: int = IW12_ROUNDS,
+) -> Tensor:
+    """Return scaled normals b (P, 3) of I = L b + e with sparse e: each error has its own variance gamma.
+
+    b = (L' W L + sigma^2)^-1 L' W I with W = diag(1 / gamma); gamma_k = e_k^2 + var(e_k), where var(e) is
+    the diagonal of L (L' W L + sigma^2)^-1 L'. Where b explains an observation, its variance shrinks and its weight
+    grows. Shadows and highlights keep a large variance.
+
+    The constants require a fixed scale: the largest observation of a pixel is 1, so bright and dark pixels are treated
+    alike. Variances start at 1, so the first step is least squares. sigma is 1e-6 (eq. 12), the ridge of
+    weighted_least_squares.
+
+    Args:
+        observations: (P, F) float64, the largest of each pixel 1.
+        light_directions: (F, 3) or (P, F, 3) float64, unit.
+        valid: (P, F) bool. None means all are valid.
+        shadow_share: see lit_observations. 0 keeps all observations.
+    """
+    lit = lit_observations(observations, shadow_share, valid).to(observations.dtype)
+    variance = torch.ones_like(observations)
+    for _ in range(iterations):
+        scaled_normals, uncertainty = weighted_least_squares(observations, light_directions, lit / variance)
+        error = observations - dot(scaled_normals, light_directions)
+        variance = (error.square() + uncertainty).clamp(min=SMALLEST_VARIANCE)
+    return scaled_normals

@@ -1,0 +1,1 @@
+"""Lights that are found or refined, and the light that reaches each pixel: near lamps, interreflection."""

@@ -1,0 +1,397 @@
+"""How well images fit light directions, also in other orders of the lights, and rough directions refined by the images.
+
+The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
+(Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
+factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
+Lights in a wrong order are not.
+
+To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is
+linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a
+prior around the given ones. The prior holds what the images leave open: lights and normals may turn together. If the
+light intensities are known, nothing else is open. If not, a prior on them holds the generalised bas-relief ambiguity
+(Belhumeur, Kriegman and Yuille, IJCV 1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.record import Capture
+from splinecli.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
+from splinecli.errors import UsageError
+from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
+from splinecli.maths import Doubles, Floats, Singles
+from splinecli.maths.normals import angle_between_deg, unit
+
+LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
+
+DARK_SHARES = (0.1, 0.02)
+"""Pixels below this share of the brightest hundredth are left out: background. The second counts where too few are left
+by the first, because highlights outshine the object."""
+
+MIN_PIXELS_PER_LIGHT = 10
+
+MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
+RANDOM_ORDERS = 250  # number of random orders of the lights that a given order is compared with
+INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
+
+INTENSITY_LIMITS = (0.1, 10.0)
+
+_ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
+_PRIOR = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """The best factors of rank 3 of some observations."""
+
+    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
+    # matrices is one between images, as a share of the mean brightness
+    matrix: Doubles
+    image_residuals: Doubles  # (F,), root mean squares of what the factors do not explain of each image, in this unit
+    intensities_known: bool = True  # whether the observations were divided by measured light intensities
+
+    @property
+    def residual(self) -> float:
+        """What the factors do not explain of all images."""
+        return float(np.linalg.norm(self.image_residuals))
+
+    def with_free_intensities(self) -> Factors:
+        """Return the factors of the same observations, to be compared with lights of any intensities."""
+        return replace(self, intensities_known=False)
+
+    def misfits(self, light_directions: Doubles) -> Doubles:
+        """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
+        if self.intensities_known:
+            return self.distances(np.linalg.qr(light_directions)[0])
+        intensities, matrices = self._fit_intensities(light_directions)
+        differences = self.matrix.T - intensities[..., None] * matrices
+        return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
+
+    def distances(self, bases: Doubles) -> Doubles:
+        """Return the root mean square distances (N,) from the images that orthonormal bases (N, F, 3) can explain."""
+        explained = ((self.matrix @ bases) ** 2).sum(axis=(1, 2))
+        return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
+
+    def intensities(self, light_directions: Doubles) -> Doubles:
+        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones where they are known."""
+        if self.intensities_known:
+            return np.ones(light_directions.shape[:2])
+        return self._fit_intensities(light_directions)[0]
+
+    def _fit_intensities(self, light_directions: Doubles) -> tuple[Doubles, Doubles]:
+        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
+        # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
+        prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
+        intensities = np.ones(light_directions.shape[:2])
+        for _ in range(_INTENSITY_ROUNDS):
+            vectors = intensities[..., None] * light_directions
+            transposed = vectors.swapaxes(1, 2)
+            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may lie in one plane
+            matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
+            along = np.einsum("cf,nfc->nf", self.matrix, matrices)
+            intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
+            intensities = intensities.clip(*INTENSITY_LIMITS)
+        return intensities, matrices
+
+
+def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
+    """Return the factors of observations (P, F), or None where there are too few lit ones.
+
+    Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
+    """
+    values = sample_pixels(observations)
+    n_pixels, n_lights = values.shape
+    if n_lights < 4 or n_pixels < MIN_PIXELS_PER_LIGHT * n_lights:
+        return None
+    lit = (values > LIT_SHARE).astype(np.float64)
+    matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
+    weights = lit
+    for _ in range(_ROUNDS):
+        rows = fit_scaled_normals(values, weights, matrix.T, prior=_PRIOR)
+        matrix = fit_scaled_normals(values.T, weights.T, rows, prior=_PRIOR).T
+        residuals = values - rows @ matrix
+        weights = lit * absolute_weights(residuals)
+    # The largest values of a row are 1, but a few rows in deep shadow may be wild.
+    kept = np.abs(rows @ matrix).max(axis=1) < 3
+    rows, residuals, lit = rows[kept], residuals[kept], lit[kept]
+    if len(rows) < MIN_PIXELS_PER_LIGHT * n_lights:
+        return None
+    brightness = np.sqrt((values[kept] ** 2).sum(axis=1).mean())
+    scale = np.linalg.qr(rows)[1] / np.sqrt(len(rows)) / brightness
+    residuals = np.sqrt((residuals**2 * lit).mean(axis=0)) / brightness
+    return Factors(scale @ matrix, residuals, intensities_known)
+
+
+def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
+    """Return the misfits of the lights (F, 3) in random orders, in rising order."""
+    given = np.tile(np.arange(len(light_directions)), (RANDOM_ORDERS, 1))
+    orders = np.random.default_rng(0).permuted(given, axis=1)
+    if factors.intensities_known:
+        # One basis serves all orders, which saves most of the time.
+        return np.sort(factors.distances(np.linalg.qr(light_directions)[0][orders]))
+    return np.sort(factors.misfits(light_directions[orders]))
+
+
+def shifted_orders(n_lights: int) -> NDArray[np.int64]:
+    """Return the orders (2 F, F) of all cyclic shifts, then those of the reversed order's; the first is the given."""
+    steps = np.arange(n_lights)
+    forward = (steps[None] + steps[:, None]) % n_lights
+    return np.concatenate((forward, forward[:, ::-1]))
+
+
+def swapped_orders(n_lights: int) -> NDArray[np.int64]:
+    """Return the orders (F (F - 1) / 2, F) with two lights exchanged."""
+    first, second = np.triu_indices(n_lights, 1)
+    orders = np.tile(np.arange(n_lights), (len(first), 1))
+    rows = np.arange(len(first))
+    orders[rows, first], orders[rows, second] = second, first
+    return orders
+
+
+def fit_residual(values: Doubles, light_directions: Doubles) -> float:
+    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3).
+
+    It is a share of the mean of the lit values.
+    """
+    lit = (values > LIT_SHARE).astype(np.float64)
+    normals, _ = fit_robustly(values, lit, light_directions, 5)
+    residuals = values - normals @ light_directions.T
+    return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
+
+
+def sample_pixels(observations: Floats) -> Doubles:
+    """Return lit pixels (p, F), each scaled to a largest observation of 1."""
+    n_lights = observations.shape[1]
+    for share in DARK_SHARES:
+        _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
+        # Three unknowns need more than three lit observations to leave a residual.
+        kept: Doubles = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+        if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
+            break
+    return kept
+
+
+LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
+
+LARGEST_LIGHT_ERROR_DEG = 30.0
+
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
+
+BETTER_FIT = 0.7
+"""Refined lights are taken if the median residual falls below this share of that under the given lights. On rendered
+captures with exact lights, it seldom does; docs/measurements.md has the figures."""
+
+MAX_MISFIT = 0.018
+"""Largest median residual, as a share of a pixel's brightest observation, with which refined lights are taken. Metals
+have more, and a matte model would move their lights wrongly."""
+
+ROUGH_MISFIT = 0.04
+"""Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to be
+suggested. Few matte or shiny captures with exact lights have more."""
+
+INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
+
+_MIN_PIXELS = 100
+_SHADOW_SHARE = 0.1  # of the pixel's quantile below, as in IW12
+_WORTH_PIXELS = 50.0  # see fit_near
+
+_FIRST_FITS, _FITS_PER_ROUND = 8, 2
+
+
+class LightFit(NamedTuple):
+    """Lights that fit the images best near given ones."""
+
+    directions: Doubles  # (F, 3), unit
+    intensities: Doubles  # (F,), relative to those of the observations
+    # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
+    # observation
+    before: float
+    after: float
+
+    @property
+    def fit_ratio(self) -> float:
+        """The median residual, as a share of that under the given lights."""
+        return self.after / max(self.before, 1e-12)
+
+
+def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
+    """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
+
+    Args:
+        error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
+        intensities_known: whether the light intensities were measured.
+
+    Raises:
+        UsageError: the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
+    """
+    check_distant("--refine-lights", "refines", near=capture.lamps is not None)
+    error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
+    check_light_error(error_deg, refines=True)
+    found = refine_lights(
+        capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
+    )
+    if found is None:
+        kept = CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {_why_kept(capture)}.")
+        return replace(capture, warnings=(*capture.warnings, kept))
+    intensities = capture.estimated_intensities
+    if not intensities_known:
+        intensities = found.intensities if intensities is None else intensities * found.intensities
+    moved_deg = angle_between_deg(found.directions, capture.light_directions)
+    text = (
+        f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}. The images fit them better: {100 * found.fit_ratio:.0f} % of the misfit is left."
+    )
+    return replace(
+        capture,
+        observations=np.asarray(capture.observations / found.intensities, np.float32),
+        light_directions=found.directions,
+        estimated_intensities=intensities,
+        warnings=(*capture.warnings, CaptureWarning(REFINED_LIGHTS, text)),
+    )
+
+
+def would_refine(observations: Floats, factors: Factors | None, light_directions: Doubles) -> LightFit | None:
+    """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
+
+    It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
+    """
+    if factors is None or factors.misfits(light_directions[None])[0] < ROUGH_MISFIT:
+        return None
+    # Intensities that nobody measured are not the fault of the directions.
+    intensities = factors.intensities(light_directions[None])[0]
+    return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
+
+
+def _why_kept(capture: Capture) -> str:
+    if capture.n_lights < MIN_LIGHTS:
+        return f"there are fewer than {MIN_LIGHTS} lights"
+    if _choose_pixels(capture.observations) is None:
+        return f"there are fewer than {_MIN_PIXELS} lit pixels"
+    return "no others near them fit the images much better"
+
+
+def check_distant(option: str, verb: str, *, near: bool) -> None:
+    """Raise UsageError for a capture with near lamps under an option that refines or finds distant lights."""
+    if near:
+        raise UsageError(f"{option} {verb} distant lights, and this capture has near lamps", hint=f"Leave {option} out")
+
+
+def check_light_error(error_deg: float | None, *, refines: bool) -> None:
+    """Raise UsageError for a usual error of directions that is out of range, or given where none are refined."""
+    if error_deg is None:
+        return
+    if not refines:
+        raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
+    if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
+        raise UsageError(
+            f"the light error is {error_deg:g} degrees, expected above 0 and at most {LARGEST_LIGHT_ERROR_DEG:g}"
+        )
+
+
+def refine_lights(
+    observations: Singles,
+    light_directions: Doubles,
+    *,
+    error_deg: float = LIGHT_ERROR_DEG,
+    intensities_known: bool = True,
+) -> LightFit | None:
+    """Return refined lights; None where the images do not tell, or the given lights fit about as well.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        light_directions: (F, 3), unit.
+        error_deg, intensities_known: see refine_capture.
+    """
+    intensity_error = 0.0 if intensities_known else INTENSITY_ERROR
+    fit = fit_near(
+        observations, light_directions, error_deg, intensity_error=intensity_error, worth_pixels=_WORTH_PIXELS
+    )
+    if fit is None:
+        return None
+    better = fit.after < MAX_MISFIT and fit.fit_ratio < BETTER_FIT and bool((fit.directions[:, 2] > 0).all())
+    return fit if better else None
+
+
+def fit_near(
+    observations: Singles,
+    light_directions: Doubles,
+    error_deg: float | Doubles,
+    *,
+    intensity_error: float,
+    worth_pixels: float,
+) -> LightFit | None:
+    """Return the lights near the given ones that fit the images best; None for too few lights or lit pixels.
+
+    Args:
+        observations: (P, F), linear.
+        light_directions: (F, 3), unit.
+        error_deg: the usual error of each direction (F,), or of all.
+        intensity_error: the usual error of intensities of 1, a share; 0 if they are known.
+        worth_pixels: the number of pixels that the images weigh against the prior. Errors of a matte model are alike in
+            many pixels.
+    """
+    values = _choose_pixels(observations)
+    if values is None:
+        return None
+    reference = _SHADOW_SHARE * np.quantile(values, 0.6, axis=1, keepdims=True)
+    lit = (values > reference).astype(np.float64)
+    lights = light_directions
+    normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)
+    before = _misfit(values, normals, lights, lit)
+    precision = _prior(light_directions, error_deg, intensity_error or INTENSITY_ERROR)
+    for _ in range(150):
+        normals, weights = fit_robustly(values, lit, lights, _FITS_PER_ROUND, weights)
+        moved = _move_lights(values, normals, weights, lights, light_directions, precision, worth_pixels)
+        moved = moved if intensity_error else unit(moved)
+        change, lights = np.abs(moved - lights).max(), moved
+        if change < 1e-4:
+            break
+    normals, _ = fit_robustly(values, lit, lights, _FIRST_FITS, weights)
+    after = _misfit(values, normals, lights, lit)
+    return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
+
+
+def _choose_pixels(observations: Singles) -> Doubles | None:
+    """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
+    if observations.shape[1] < MIN_LIGHTS:
+        return None
+    _, values = lit_values(observations, 0.02, 2000)
+    return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
+
+
+def _misfit(values: Doubles, normals: Doubles, lights: Doubles, lit: Doubles) -> float:
+    return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
+
+
+def _prior(light_directions: Doubles, error_deg: float | Doubles, intensity_error: float) -> Doubles:
+    """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
+    along = light_directions[:, :, None] * light_directions[:, None, :]
+    # The angle has two components, each with half of its variance.
+    across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
+    return np.asarray((np.eye(3) - along) / across_variance + along / intensity_error**2)
+
+
+def _move_lights(
+    values: Doubles,
+    normals: Doubles,
+    weights: Doubles,
+    lights: Doubles,
+    given: Doubles,
+    precision: Doubles,
+    worth_pixels: float,
+) -> Doubles:
+    """Return the light vectors (F, 3) that fit the observations best, within the prior."""
+    residuals = values - normals @ lights.T
+    variance = (weights * residuals**2).sum() / weights.sum()
+    # A light that no pixel shows keeps its given vector.
+    scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
+    curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
+    gradient = ((weights * residuals).T @ normals) * scale[:, None]
+    pull = np.einsum("fij,fj->fi", precision, given - lights)
+    step = np.linalg.solve(curvature + precision, (gradient + pull)[..., None])[..., 0]
+    return np.asarray(lights + step)

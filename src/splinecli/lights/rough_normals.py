@@ -1,0 +1,264 @@
+"""Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows, by cast shadows.
+
+Evidence on the frame of light directions, from the normals that they give. Lights in a wrong frame fit the images as
+well as right ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
+Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
+1981).
+
+Tell bumps from hollows by the shadows that a surface casts on itself. With x and y of all lights negated, the normals
+are those of the surface turned inside out. It has the same shading and the same attached shadows (Belhumeur, Kriegman
+and Yuille, IJCV 1999), but it casts shadows in other places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splinecli.fits.robust import fit_robustly, shadow_weights
+from splinecli.maths import Bools, Doubles, Floats
+from splinecli.maths.normals import angle_between_deg, unit
+
+SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
+RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
+STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
+_LOWEST_Z = 0.2  # slopes grow without bound towards the outline
+_FITS = 5  # weighted fits to a pixel
+_TURNED_PIXELS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class RoughNormals:
+    """Normals on a grid of pixels."""
+
+    normals: Doubles  # (h, w, 3), unit in the mask, zero outside
+    mask: Bools  # (h, w)
+    outward: Doubles  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
+
+    @property
+    def rim_steepness(self) -> float:
+        """The share of the rim's pixels that are steep. It does not depend on the frame of the lights."""
+        rim = self.outward.any(axis=2)
+        return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
+
+    def transformed(self, matrix: Doubles) -> RoughNormals:
+        """Return the normals that the lights would give after a multiplication with a matrix (3, 3)."""
+        normals = self.normals @ np.linalg.inv(matrix)
+        return RoughNormals(np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward)
+
+    def curl(self) -> float:
+        """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
+        if (found := self._derivatives_inside()) is None:
+            return float("nan")
+        (p_x, p_y), (q_x, q_y) = found
+        size = np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
+        return float(np.median(np.abs(p_y - q_x)) / max(np.median(size), 1e-12))
+
+    def least_curl_deg(self, *, mirrored: bool) -> float:
+        """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the least curl.
+
+        They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A rotation by 180 degrees
+        more has the same curl. NaN where there are too few pixels.
+        """
+        if (found := self._derivatives_inside()) is None:
+            return float("nan")
+        (p_x, p_y), (q_x, q_y) = found
+        p_x, p_y = (-p_x, -p_y) if mirrored else (p_x, p_y)
+        step = max(1, len(p_x) // _TURNED_PIXELS)
+        angles = np.radians(np.arange(-90, 90))[:, None]
+        # The slopes rotate with the normals.
+        curls = np.cos(angles) * (p_y - q_x)[::step] - np.sin(angles) * (p_x + q_y)[::step]
+        return float(np.median(np.abs(curls), axis=1).argmin() - 90)
+
+    def _derivatives_inside(self) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]] | None:
+        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None for too few."""
+        from scipy.ndimage import binary_erosion
+
+        z = np.maximum(self.normals[..., 2], _LOWEST_Z)
+        inside = binary_erosion(self.mask & (self.normals[..., 2] > _LOWEST_Z))
+        if inside.sum() < 50:
+            return None
+        p, q = (_derivatives(-self.normals[..., axis] / z) for axis in (0, 1))
+        return (p[0][inside], p[1][inside]), (q[0][inside], q[1][inside])
+
+    def rim(self) -> float:
+        """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.
+
+        It is 1 for a closed convex outline, 0 where one axis is flipped, and -1 where both are.
+        """
+        steep = self.outward.any(axis=2) & (self.normals[..., 2] < STEEP_Z)
+        if not steep.any():
+            return float("nan")
+        along = unit(self.normals[steep][:, :2])
+        return float((along * self.outward[steep]).sum(axis=1).mean())
+
+
+def rough_normals(observations: Floats, light_directions: Doubles, mask: Bools) -> RoughNormals:
+    """Return smoothed normals of a fit of least absolute deviations.
+
+    Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
+    """
+    values = observations.astype(np.float64)
+    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)
+
+
+def median_turn_deg(
+    observations: Floats, lights: Doubles, other_lights: Doubles, other_observations: Floats | None = None
+) -> float:
+    """Return the median angle in degrees between the normals that two readings of a capture give.
+
+    It is the error of the first reading if the second is right. Each is a robust fit of observations (P, F) under
+    lights (F, 3) or (P, F, 3); None for the observations of the first reading.
+    """
+    readings = (
+        (observations, lights),
+        (observations if other_observations is None else other_observations, other_lights),
+    )
+    step = max(1, len(observations) // _TURNED_PIXELS)
+    normals = []
+    for values, directions in readings:
+        values = values[::step].astype(np.float64)
+        values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+        own = directions if directions.ndim == 2 else directions[::step]
+        normals.append(unit(fit_robustly(values, shadow_weights(values), own, _FITS)[0]))
+    return float(np.median(angle_between_deg(*normals)))
+
+
+def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
+    """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H, W)."""
+    from scipy.ndimage import gaussian_filter
+
+    normals = np.zeros((*mask.shape, 3))
+    normals[mask] = unit(vectors)
+    smooth = gaussian_filter(normals, (SMOOTHING, SMOOTHING, 0))
+    smooth = np.where(mask[..., None], unit(smooth), 0.0)
+    return RoughNormals(smooth, mask, _outward(mask))
+
+
+def _outward(mask: Bools) -> Doubles:
+    """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
+    from scipy.ndimage import distance_transform_edt
+
+    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
+    if padded.all():
+        return np.zeros((*mask.shape, 2))
+    inner = slice(RIM_PIXELS + 1, -RIM_PIXELS - 1)
+    rim = (mask & (distance_transform_edt(padded)[inner, inner] <= RIM_PIXELS))[..., None]
+    return np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
+
+
+def outward_directions(mask: Bools, sigma: float) -> Doubles:
+    """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels falls; else zero."""
+    from scipy.ndimage import gaussian_filter
+
+    return unit(-np.stack(_derivatives(gaussian_filter(mask.astype(np.float64), sigma)), axis=2))
+
+
+def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the derivatives to the right and upwards; zero along a side of one pixel."""
+    downwards, right = (
+        np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)
+    )
+    return np.asarray(right), np.asarray(-downwards)
+
+
+AGREEMENT_WEIGHT = 5.0
+"""Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9 with right
+lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01."""
+
+MISSING, MISSING_OF_OTHER = 0.02, 0.1
+"""From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
+reading has at most the second part of it."""
+
+OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.01, 0.75
+"""The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were
+rendered without cast shadows, which is not evidence against the lights."""
+
+_FEWEST_SHARE, _FEWEST = 0.001, 20  # of lit observations in shadow, below which they are noise and highlights
+_MAX_PIXELS, _MAX_LIGHTS = 6000, 24
+_LIT_SHARE, _DARK_SHARE = 0.25, 0.4  # of a pixel's brightest shading, and of its own, beyond which shadows are judged
+_MARGIN = 0.5  # pixels that a surface must rise above a ray
+
+
+@dataclass(frozen=True, eq=False)
+class Shadows:
+    """How well cast shadows of a surface agree with dark observations that should be lit."""
+
+    agreement: float  # correlation, from -1 to 1; 0 where too few are dark
+    missing: float  # share of the lit observations that should be in cast shadow, but are bright
+
+    def evidence(self, other: Shadows) -> float:
+        """Return the evidence for another reading against this one, as an advantage of light_check.py."""
+        found = AGREEMENT_WEIGHT * (other.agreement - self.agreement)
+        if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
+            return found + 1
+        if other.missing > MISSING and self.missing < MISSING_OF_OTHER * other.missing:
+            return found - 1
+        return found
+
+    def leaves_open(self, other: Shadows) -> bool:
+        """Return whether shadows that this reading needs are missing, more than those of another one."""
+        return self.missing > OPEN_MISSING and other.missing < OPEN_MISSING_OF_OTHER * self.missing
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowCheck:
+    """Dark observations of a sample, to be compared with the shadows of its surfaces under its lights."""
+
+    normals: RoughNormals  # on a coarser grid
+    lights: Doubles  # (f, 3)
+    lit: Bools  # (p, f), whether a matte pixel would be bright
+    dark: Bools  # (p, f), whether it is dark nevertheless
+
+    @classmethod
+    def of(cls, observations: Floats, lights: Doubles, normals: RoughNormals) -> ShadowCheck:
+        """Return the check of observations (P, F) under lights (F, 3), with the smoothed normals that these give."""
+        step = max(1, int(np.ceil(np.sqrt(len(observations) / _MAX_PIXELS))))
+        part = slice(None, None, step), slice(None, None, step)
+        rows = np.zeros(normals.mask.shape, np.intp)
+        rows[normals.mask] = np.arange(len(observations))
+        coarse = RoughNormals(normals.normals[part], normals.mask[part], normals.outward[part])
+        chosen = np.linspace(0, len(lights) - 1, min(len(lights), _MAX_LIGHTS)).astype(int)
+        values = observations[rows[part][coarse.mask]].astype(np.float64)
+        values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+        shading = fit_robustly(values, shadow_weights(values), lights, _FITS)[0] @ lights[chosen].T
+        lit = shading > _LIT_SHARE * shading.max(axis=1, keepdims=True).clip(min=1e-12)
+        return cls(coarse, lights[chosen], lit, lit & (values[:, chosen] < _DARK_SHARE * shading))
+
+    def shadows(self, matrix: Doubles) -> Shadows:
+        """Return the shadows under the lights after a multiplication with a matrix (3, 3)."""
+        from splinecli.surface.integration import integrate_normals
+
+        normals = self.normals.transformed(matrix)
+        if not self.lit.any():
+            return Shadows(0.0, 0.0)
+        heights = integrate_normals(normals.normals, normals.mask, stiffness=0)
+        cast = cast_shadows(heights, self.lights @ matrix.T)[normals.mask][self.lit]
+        dark = self.dark[self.lit]
+        common = np.count_nonzero(cast & dark)
+        agreement = 0.0
+        if common >= max(_FEWEST, _FEWEST_SHARE * len(dark)) and not cast.all() and not dark.all():
+            agreement = float(np.corrcoef(cast, dark)[0, 1])
+        return Shadows(agreement, float((cast & ~dark).mean()))
+
+
+def cast_shadows(heights: Doubles, lights: Doubles) -> Bools:
+    """Return where a surface shades itself (h, w, F), from heights (h, w) in pixels, NaN outside the object."""
+    height, width = heights.shape
+    relief = float(np.nanmax(heights) - np.nanmin(heights))
+    padded = np.full((3 * height, 3 * width), -np.inf)
+    padded[height : 2 * height, width : 2 * width] = np.where(np.isfinite(heights), heights, -np.inf)
+    surface = np.where(np.isfinite(heights), heights, np.inf)
+    cast = np.zeros((height, width, len(lights)), np.bool_)
+    for place, (x, y, z) in enumerate(lights):
+        level = float(np.hypot(x, y))
+        # A ray that has climbed by the whole relief meets nothing.
+        longest = max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
+        for step in range(2, longest if level > 0 else 0):
+            down, right = round(-y / level * step), round(x / level * step)
+            if abs(down) < height and abs(right) < width:
+                rows, columns = slice(height + down, 2 * height + down), slice(width + right, 2 * width + right)
+                cast[..., place] |= padded[rows, columns] > surface + z / level * step + _MARGIN
+    return cast

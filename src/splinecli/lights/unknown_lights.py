@@ -1,0 +1,400 @@
+"""Lights from the images of the object alone (uncalibrated photometric stereo), and what its shading leaves open.
+
+What the shading of a matte surface leaves open about its lights, and the evidence that decides it. A bump looks like a
+hollow under lights with x and y negated: shading, attached shadows and highlights are equal, also the curl of the
+normals. Cast shadows and the outline differ. And the heights of a surface may be scaled if its lights are lowered or
+raised with them, the generalised bas-relief ambiguity, which keeps all shadows (Belhumeur, Kriegman and Yuille, "The
+bas-relief ambiguity", IJCV 1999). The albedo then changes with the slope.
+
+The common rotation of lights and normals that the outline of the object shows. Where a smooth surface turns away from
+the camera, its normals are perpendicular to the view and to the outline. Lights that were turned together turn all
+normals with them, also those at the outline.
+
+The light network guesses each light from shading, shadows and outline, with an error that it expects. The images then
+decide what they can: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights are
+moved together until such a surface explains the images, within the guesses and their errors. What the shading of a
+matte surface leaves open is decided by cast shadows, the outline and the albedo.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.capture.record import FoundLights, azimuth_of
+from splinecli.errors import InputError
+from splinecli.fits.robust import fit_robustly, lit_values, shadow_weights
+from splinecli.lights.light_fit import INTENSITY_ERROR, fit_near
+from splinecli.lights.rough_normals import cast_shadows, outward_directions, smooth_normals
+from splinecli.maths import Bools, Doubles, Singles
+from splinecli.maths.normals import unit
+from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
+from splinecli.networks.weights import light_net
+from splinecli.surface.integration import integrate_normals
+from splinecli.surface.pixel_grid import Blocks
+from splinecli.system.machine import side_by_side
+
+# Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions (3 % without the outline).
+_SHADOW_LOG_ODDS, _OUTLINE_LOG_ODDS = 11.0, 8.0
+
+_BLOCKS = 1200  # at most twice as many
+_FITS = 5
+_LEAST_Z = 0.1  # of normals that are integrated
+_FACING = 0.15  # predicted share of a pixel's brightest observation, above which darkness is a cast shadow
+_SHADOW = 0.5  # of the predicted brightness
+_DARK_SHARE = 0.02  # of the brightest hundredth
+
+_LOW_DEG = 55.0  # mean elevation of lights, below which the network finds them too high
+_LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)  # logarithms of the factors of the heights of the lights that are tried
+_HEIGHT_PRIOR = 49.0  # entropy per square of this logarithm and of the expected error in degrees
+_ALBEDO_BIN, _ALBEDO_BINS = 0.1, 41  # of the logarithm of the albedo
+_MOST_FITTED, _SHADE = 2000, 0.1
+
+
+def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles) -> float:
+    """Return the log odds that the lights are right against that their x and y are negated.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        mask: (H, W) with P true pixels, in row-major order.
+        light_directions: (F, 3), unit.
+    """
+    blocks = Blocks.over(mask, _BLOCKS)
+    values, mask = blocks.average(observations, mask).astype(np.float64), blocks.mask
+    brightest = values.max(axis=1, keepdims=True)
+    bright = brightest > _DARK_SHARE * np.quantile(brightest, 0.99)
+    values /= np.maximum(brightest, 1e-12)
+    scaled, _ = fit_robustly(values, shadow_weights(values), light_directions, _FITS)
+    rough = smooth_normals(scaled, mask)
+    rim = rough.rim()
+    outline = 0.0 if np.isnan(rim) else rim * rough.rim_steepness
+
+    normals = np.zeros((*mask.shape, 3))
+    normals[mask] = unit(scaled)
+    normals[..., 2] = np.where(mask, normals[..., 2].clip(min=_LEAST_Z), 0)
+    heights = np.where(mask, integrate_normals(unit(normals), mask), np.nan)
+    predicted = scaled @ light_directions.T
+    facing = bright & (predicted > _FACING)
+    dark = values[facing] < _SHADOW * predicted[facing]
+    bump, hollow = (
+        _correlation(cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark)
+        for sign in (1, -1)
+    )
+    return _SHADOW_LOG_ODDS * (bump - hollow) + _OUTLINE_LOG_ODDS * outline
+
+
+def _correlation(predicted: Bools, seen: Bools) -> float:
+    """Return the correlation of two sets; 0 where one has all or none."""
+    if min(predicted.sum(), (~predicted).sum(), seen.sum(), (~seen).sum()) == 0:
+        return 0.0
+    return float(np.corrcoef(predicted, seen)[0, 1])
+
+
+def lower_lights(observations: Singles, light_directions: Doubles, error_deg: float) -> Doubles:
+    """Return low lights (F, 3), lowered together towards those under which the albedo has few values; others as given.
+
+    The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity
+    by entropy minimization", CVPR 2007). Lights are only lowered, as the network's errors are upwards.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        light_directions: (F, 3), unit.
+        error_deg: the mean expected error.
+    """
+    if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > _LOW_DEG:
+        return light_directions
+    chosen, values = lit_values(observations, _DARK_SHARE, _MOST_FITTED)
+    lit = values > _SHADE * np.quantile(values, 0.6, axis=1, keepdims=True)
+    scaled, _ = fit_robustly(values, lit.astype(np.float64), light_directions, _FITS)
+    known = (lit.sum(axis=1) > 3) & (unit(scaled)[:, 2] > _LEAST_Z)
+    scaled = (scaled * observations[chosen].max(axis=1)[:, None])[known]
+    if len(scaled) < _ALBEDO_BINS:
+        return light_directions
+    prior = _HEIGHT_PRIOR / error_deg**2
+    costs = [_entropy(scaled / (1, 1, np.exp(log))) + prior * log**2 for log in _LOG_HEIGHTS]
+    return np.asarray(unit(light_directions * (1, 1, np.exp(_LOG_HEIGHTS[int(np.argmin(costs))]))))
+
+
+def _entropy(scaled_normals: Doubles) -> float:
+    """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their median."""
+    albedo = np.log(np.linalg.norm(scaled_normals, axis=1))
+    places = np.rint((albedo - np.median(albedo)) / _ALBEDO_BIN) + _ALBEDO_BINS // 2
+    counts = np.bincount(places.clip(0, _ALBEDO_BINS - 1).astype(int), minlength=_ALBEDO_BINS)
+    shares = np.convolve(counts / len(albedo), (0.25, 0.5, 0.25))
+    return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum())
+
+
+Array = NDArray[np.float64]
+
+MIN_PIXELS = 20  # fewer lit pixels at the outline show no rotation
+
+_SMOOTHING = 0.02
+"""Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
+
+_BORDER = 0.01  # masks of objects that fill the image may leave out a border of this share of its sides
+
+_RIM_Z = 0.25
+"""Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
+
+_LIT_SHARE, _RIM_DARK_SHARE, _MIN_LIT, _RIM_FITS = 0.1, 0.02, 4, 6
+_EQUAL_WEIGHT_BELOW, _PRIOR = 0.1, 1e-3
+_ROUNDS, _CONVERGED = 25, 1e-4
+
+
+class OutlineTurn(NamedTuple):
+    """A rotation that turns the normals at the outline outwards."""
+
+    rotation: Array  # (3,), the rotation vector of lights and normals
+    # the median of what remains of the z of these normals; small where the outline is that of a smooth surface
+    spread: float
+
+    @property
+    def angle_deg(self) -> float:
+        """The angle of the rotation."""
+        return float(np.degrees(np.linalg.norm(self.rotation)))
+
+    def share(self, part: float) -> Array:
+        """Return a part of the rotation (3, 3), from 0 to 1."""
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
+
+
+def turn_at_outline(
+    observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
+) -> OutlineTurn | None:
+    """Return the rotation of the lights that the outline shows, or None. The border of the image is no outline.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        mask: (H, W) with P true pixels, in row-major order.
+        light_directions: (F, 3), unit.
+    """
+    from scipy.spatial.transform import Rotation
+
+    normals, outwards = _rim(observations, mask, light_directions)
+    if len(normals) < MIN_PIXELS:
+        return None
+    along = np.cross((0.0, 0.0, 1.0), outwards)
+    turn = Rotation.identity()
+    for _ in range(_ROUNDS):
+        turned = turn.apply(normals)
+        # A small turn w adds w x n. The first residual is along the view axis, the second along the outline.
+        residuals = np.stack((turned[:, 2] - _RIM_Z, (turned * along).sum(axis=1)))
+        slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
+        weights = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
+        curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + _PRIOR * np.eye(3)
+        step = np.linalg.solve(curvature, -np.einsum("kp,kpi,kp->i", weights, slopes, residuals))
+        turn = Rotation.from_rotvec(step) * turn
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
+
+
+def outline_share(mask: NDArray[np.bool_]) -> float:
+    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of the image."""
+    boundary = _boundary(mask)
+    rows, columns = (1 + round(_BORDER * side) for side in mask.shape)
+    inside = boundary[rows:-rows, columns:-columns]
+    return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
+
+
+def _boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels of a mask (H, W) at its outer boundary; holes have none."""
+    from scipy.ndimage import binary_erosion, binary_fill_holes
+
+    filled = binary_fill_holes(mask)
+    return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
+
+
+def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array) -> tuple[Array, Array]:
+    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
+    rim = _boundary(mask)
+    rim[[0, -1]] = rim[:, [0, -1]] = False
+    width = max(1.5, _SMOOTHING * float(np.sqrt(np.count_nonzero(mask))))
+    outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
+    values = observations[rim[mask]].astype(np.float64)
+    brightest = values.max(axis=1, keepdims=True, initial=0)
+    values = values / np.maximum(brightest, 1e-12)
+    lit = (values > _LIT_SHARE).astype(np.float64)
+    bright = brightest[:, 0] > _RIM_DARK_SHARE * np.quantile(observations.max(axis=1), 0.99)
+    seen = (lit.sum(axis=1) >= _MIN_LIT) & bright & outwards.any(axis=1)
+    if not seen.any():
+        return np.empty((0, 3)), np.empty((0, 3))
+    fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, _RIM_FITS)
+    return unit(fitted), outwards[seen]
+
+
+LARGEST_ERROR_DEG = 20.0
+"""Lights with a larger expected error on average are refused: their normals would be worth little."""
+
+LARGEST_MISFIT = 0.08
+"""Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes, metals
+among them, have at most half of it."""
+
+LEAST_OUTLINE = 0.5
+"""Smallest share of the mask's boundary inside the image. With less, the object continues outside of it."""
+
+LEAST_SIDE = 0.15
+"""Smallest share of a direction towards a side from which a light comes: 9 degrees from the camera axis."""
+
+SAME_IMAGES = 0.01  # images that differ by less from their mean, as a share of it, show no light that moves
+
+# Chosen on rendered scenes that the network was not trained on.
+_WORTH_PIXELS = 6.0  # see fit_near
+_CLEAR_OUTLINE = 0.2  # largest spread of an outline that counts
+_OUTLINE_SHARE = 0.35  # of the turn that it shows
+_LARGEST_TURN = 2.0  # times the expected error; what a larger turn has beyond it comes from the mouth of a vessel
+# Log odds that the network takes a bump for a bump: fewer where it expects larger errors.
+_MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
+# The mean error of what is returned from that which the network expects, on 720 rendered captures with and without an
+# outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
+_ERROR_SCALE, _ERROR_POWER, _LEAST_ERROR_DEG = 0.39, 1.3, 1.2
+_ERROR_SHARE = 0.65  # without an outline
+_MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
+_VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
+
+
+def find_lights(
+    observations: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    intensities_known: bool,
+    *,
+    first_light: str | None = None,
+    refuse: bool = True,
+) -> FoundLights:
+    """Find the lights of the images of one object.
+
+    Args:
+        observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
+        mask: (H, W) with P true pixels, in row-major order.
+        intensities_known: whether the intensities are known; else they are found, too.
+        first_light: where the light of the first observations comes from; see azimuth_of. It decides between a bump and
+            a hollow. Without it, shadows and the outline decide.
+        refuse: raise an error for lights that the images do not tell; else return a guess.
+
+    Raises:
+        UsageError: the first light is no known side, and no azimuth.
+        InputError: the images are all alike, they do not show one surface, or they do not tell the lights.
+    """
+    step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
+    if step > 1:
+        grid = np.zeros_like(mask)
+        grid[::step, ::step] = mask[::step, ::step]
+        observations, mask = observations[grid[mask]], mask[::step, ::step]
+    _check_different(observations)
+    outlined = outline_share(mask) >= LEAST_OUTLINE
+    if refuse and first_light is None and not outlined:
+        raise InputError(
+            "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
+            hint="If the images show the whole object, give its mask, or add --auto-mask. Else say where the light of"
+            " the first image that is used comes from: --first-light left, upper-left, or its azimuth in degrees,"
+            " counter-clockwise from the right",
+        )
+    directions, errors_deg, intensities = _ask_network(observations, mask)
+    if first_light is not None:
+        directions = _towards(directions, first_light)
+    if not intensities_known:
+        observations = np.asarray(observations / intensities, np.float32)
+    error = 0.0 if intensities_known else INTENSITY_ERROR
+    fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=_WORTH_PIXELS)
+    if refuse and fit is not None and fit.after > LARGEST_MISFIT:
+        problem = "the images do not show one surface under different distant lights, so the lights cannot be found"
+        hint = "Check that camera and object stood still, and that all images show the same object"
+        raise InputError(problem, hint=hint)
+    if fit is not None and fit.after < fit.before and (fit.directions[:, 2] > 0).all():
+        directions, intensities = fit.directions, intensities * fit.intensities
+        observations = np.asarray(observations / fit.intensities, np.float32)
+    expected_deg, opposite_share = float(errors_deg.mean()), 0.0
+    if first_light is None:
+        log_odds = bump_log_odds(observations, mask, directions)
+        log_odds += max(_FEWEST_LOG_ODDS, _MOST_LOG_ODDS - _LOG_ODDS_PER_DEG * expected_deg)
+        directions = directions * (-1, -1, 1) if log_odds < 0 else directions
+        opposite_share = 1 / (1 + math.exp(abs(log_odds)))
+    turn = turn_at_outline(observations, mask, directions)
+    if turn is not None and turn.spread < _CLEAR_OUTLINE:
+        share = _OUTLINE_SHARE * min(1, _LARGEST_TURN * expected_deg / max(turn.angle_deg, 1e-9))
+        turned = directions @ turn.share(share).T
+        directions = turned if (turned[:, 2] > 0).all() else directions
+    directions = lower_lights(observations, directions, expected_deg)
+    found_deg = _ERROR_SCALE * expected_deg**_ERROR_POWER if outlined else _ERROR_SHARE * expected_deg
+    errors_deg = errors_deg * math.hypot(found_deg, _LEAST_ERROR_DEG) / expected_deg
+    opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
+    errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
+    if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
+        raise InputError(
+            f"the lights cannot be told from the images: their expected error is {expected:.0f} degrees, and at most"
+            f" {LARGEST_ERROR_DEG:.0f} is of use",
+            hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
+            " lights with 'splinecli calibrate'",
+        )
+    return FoundLights(directions, errors_deg, None if intensities_known else intensities / intensities.mean())
+
+
+def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.float64]:
+    """Return the directions (F, 3), or those with opposite x and y, whichever has the first light on this side.
+
+    Raises InputError where it is on neither side clearly.
+    """
+    azimuth = math.radians(azimuth_of(first_light))
+    towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
+    if abs(towards) < LEAST_SIDE:
+        problem = f"the first light does not come clearly from {first_light}, nor from the opposite side"
+        hint = "Give its azimuth in degrees, as --first-light 45, or put an image with a light from a side first"
+        raise InputError(problem, hint=hint)
+    return directions * (-1, -1, 1) if towards < 0 else directions
+
+
+def _check_different(observations: NDArray[np.float32]) -> None:
+    """Raise InputError for images that show no change of the light."""
+    rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
+    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
+    mean = rows.mean(axis=1, keepdims=True)
+    if np.abs(rows - mean).mean() <= SAME_IMAGES * mean.mean():  # equal for black images
+        problem = "all images are alike, so they say nothing about the lights"
+        raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
+
+
+def _ask_network(
+    observations: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
+
+    They are means over the four turns of the images by 90 degrees and their mirror images.
+    """
+    area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
+    small = []
+    for values in observations.T:  # one image at a time: all of them would double the memory
+        image[mask] = values
+        cut, inside = square_images(torch.from_numpy(image)[None], area)
+        small.append(cut[0])
+    if not inside.any():
+        raise InputError(
+            "the mask is too thin or too scattered to find the lights", hint="Give a mask of the whole object"
+        )
+    images = torch.stack(small)
+    images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
+    network = light_net()
+    # One thread each, so that the number of threads does not change the rounding.
+    guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
+    directions, sharpness, log_intensities = (torch.cat(part).double() for part in zip(*guesses, strict=True))
+    towards = (sharpness.exp()[..., None] * directions).sum(dim=0)
+    mean = torch.nn.functional.normalize(towards, dim=-1)
+    between = (directions * mean).sum(dim=-1).clamp(-1, 1).acos().square().mean(dim=0)
+    own = (math.pi / 2 / sharpness.exp()).mean(dim=0)  # mean square errors of normal distributions
+    return mean.numpy(), (own + between).sqrt().rad2deg().numpy(), log_intensities.mean(dim=0).exp().numpy()
+
+
+def _view(network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool) -> LightGuess:
+    """Return what the network reads off turned, then mirrored images, in the frame of the images as they are."""
+    images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
+    if mirrored:
+        images, inside = images.flip(2), inside.flip(1)
+    guess: LightGuess = network(network_inputs(images, inside)[None])
+    x, y, z = guess.directions.unbind(dim=-1)
+    x = -x if mirrored else x
+    for _ in range(turns):
+        x, y = y, -x
+    return guess._replace(directions=torch.stack((x, y, z), dim=-1))

@@ -1,0 +1,325 @@
+"""Plots: light directions, observation maps, learning curves, and the maps of several methods side by side."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from splinecli.errors import printable
+from splinecli.maths import Bools, Doubles, Floats, Integers
+from splinecli.maths.normals import encode_picture, unit
+from splinecli.methods import method_names
+from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, Picture, bounding_box, colour_errors
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from splinecli.maths.observation_map import Grid
+
+
+class MethodStyle(NamedTuple):
+    """The style of a line: matplotlib's names of a colour and a marker."""
+
+    colour: str
+    marker: str
+
+
+# The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can distinguish. Gray
+# replaces their yellow, which is too light for a line on white. The markers help in prints without colour.
+_COLOURS = ["#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080", "#7F5F3F"]
+_STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
+    """Return the style of each method. It depends on the registry's order, so it is the same in every plot.
+
+    Names that are not in the registry follow in their order.
+    """
+    known = method_names()
+    places = known + [name for name in methods if name not in known]
+    return {name: _STYLES[places.index(name) % len(_STYLES)] for name in methods}
+
+
+def png_bytes(figure: Figure, dpi: int) -> bytes:
+    """Return a figure as a PNG file, on white whatever the user's matplotlibrc says."""
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no warning.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    return buffer.getvalue()
+
+
+_RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
+
+
+def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | None = None) -> bytes:
+    """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
+
+    The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle of this radius is
+    drawn around each light.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    axes = figure.add_subplot(aspect="equal")
+    angle = np.linspace(0, 2 * np.pi, 361)
+    for ring_deg in (*_RINGS_DEG, 90):
+        radius = np.sin(np.radians(ring_deg))
+        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1)
+        if ring_deg < 90:  # the label of 90 degrees would overlap that of 75 degrees
+            axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
+    x, y = light_directions[:, 0], light_directions[:, 1]
+    for outline in [] if errors_deg is None else _circles(light_directions, np.radians(errors_deg), angle):
+        axes.plot(*outline.T, color="#D55E00", alpha=0.4, linewidth=1, zorder=2)
+    axes.scatter(x, y, s=30, color="#D55E00", zorder=3)
+    for number, place in enumerate(zip(x, y, strict=True), start=1):
+        axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3)
+    axes.set_title(printable(title), parse_math=False)
+    axes.set_axis_off()
+    return png_bytes(figure, 120)
+
+
+def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
+    """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
+    across = unit(np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)]))
+    turned = np.cross(directions, across)
+    around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
+    cosine, sine = np.cos(radii)[:, None, None], np.sin(radii)[:, None, None]
+    return np.asarray((directions[:, None] * cosine + around * sine)[..., :2])
+
+
+_MAP_INCHES = 1.7
+_EMPTY = "0.85"  # light gray, which the colour scale does not contain
+_SMALL, _LARGE = 8, 9  # points
+
+
+def observation_map_figure(
+    sparse: Floats,
+    dense: Floats | None,
+    truth: Floats | None,
+    *,
+    error_deg: Floats,
+    pixels: Integers | None = None,
+    truth_label: str = "true map, all lights",
+    title: str = "",
+    grid: Grid = "even",
+) -> bytes:
+    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all lights.
+
+    Row 0 of a map is y = +1. The maps of a pixel share one frame, that of the camera or that of the pixel. Values are
+    relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the horizon.
+
+    Args:
+        sparse: (N, w, w), NaN in empty cells.
+        dense: the same; None for a network without a LI-Net.
+        truth: (N, w, w), NaN in cells without a value; None to leave it out.
+        error_deg: (N,) errors of the estimated normals, in degrees.
+        pixels: (N, 2) row and column in the image; None to leave them out.
+        truth_label: label of the true maps.
+        title: title of the figure; empty for none.
+        grid: how light directions are assigned to cells.
+    """
+    from matplotlib.figure import Figure
+
+    labelled = {"sparse map": sparse, "LI-Net's dense map": dense, truth_label: truth}
+    columns = {label: maps for label, maps in labelled.items() if maps is not None}
+    size = (_MAP_INCHES * len(columns) + 0.8, (_MAP_INCHES + 0.25) * len(sparse) + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=_LARGE, parse_math=False)
+    axes = figure.subplots(len(sparse), len(columns), squeeze=False)
+    for place, (name, maps) in enumerate(columns.items()):
+        for axis, values in zip(axes[:, place], maps, strict=True):
+            image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
+            _finish(axis, len(values), grid)
+        axes[-1, place].set_xlabel(name, fontsize=_SMALL)
+    places = [""] * len(sparse) if pixels is None else [f"row {row}, column {col}: " for row, col in pixels]
+    for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
+        axis.set_title(f"{place_in_image}{error:.1f} deg off", fontsize=_SMALL, loc="left")
+    bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
+    bar.set_label("relative to the largest observation", fontsize=_SMALL)
+    bar.ax.tick_params(labelsize=_SMALL)
+    return png_bytes(figure, 150)
+
+
+def _finish(axes: Axes, size: int, grid: Grid) -> None:
+    from matplotlib.patches import Circle
+
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_facecolor(_EMPTY)
+    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
+    # stand for a single line each.
+    centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
+    if grid == "cnn-ps":
+        centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
+    axes.add_patch(Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False))
+
+
+_LARGEST_LINEAR_RATIO = 20  # An axis whose values span more is logarithmic.
+
+Columns = Mapping[str, Sequence[float | None]]
+
+
+def training_figure(columns: Columns) -> Figure:
+    """Return a matplotlib figure of the loss, the angular errors and the map errors against the step.
+
+    `columns` are those of metrics.csv by name, all of one length; None marks a value that was not computed.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    loss, angle, maps = figure.subplots(1, 3)
+    loss.set_title("loss")
+    _plot(loss, columns, "loss", "weighted sum")
+    _plot(loss, columns, "symmetric", "Ls, unweighted", alpha=0.5)
+    _plot(loss, columns, "asymmetric", "La, unweighted", alpha=0.5)
+    angle.set_title("mean angular error (deg)")
+    _plot(angle, columns, "angle_deg", "training", alpha=0.5)
+    _plot(angle, columns, "validation_deg", "validation", style="o-")
+    maps.set_title("mean error of the dense map")
+    _plot(maps, columns, "map_error", "all cells")
+    _plot(maps, columns, "masked_map_error", "cells with a light")
+    for axes in (loss, angle, maps):
+        _finish_curves(axes)
+    return figure
+
+
+def _plot(axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1) -> None:
+    points = [(step, value) for step, value in zip(columns["step"], columns[name], strict=True) if value is not None]
+    if points:
+        style = "o" if len(points) == 1 else style  # one point is no line
+        axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
+
+
+def _finish_curves(axes: Axes) -> None:
+    """Add the grid, the legend and the scale, or hide axes without a curve."""
+    axes.set_visible(bool(axes.lines))
+    if not axes.lines:
+        return
+    axes.set_xlabel("step")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
+    if (values > 0).all() and values.max() > _LARGEST_LINEAR_RATIO * values.min():
+        axes.set_yscale("log")
+
+
+_MOST_WIDE = 3600  # pixels, all columns without gaps: the picture stays below 4000
+_MOST_HIGH = 1200  # pixels: one map
+_ENLARGED = 240  # pixels: small maps are enlarged while their longer side stays within it
+_SMALLEST_CELL = 150  # pixels: room for the colour bar and a name
+_LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
+_TEXT_WIDTH = 0.62  # of its height: the average width of a character
+_MAPS_DPI = 100
+_POINT = _MAPS_DPI / 72  # pixels
+
+
+def method_maps(
+    ground_truth: Floats,
+    mask: Bools,
+    normal_maps: Mapping[str, Floats],
+    error_maps_deg: Mapping[str, Floats],
+    *,
+    title: str,
+) -> bytes:
+    """Return a PNG file with a column for the ground truth and one for each method: normal map above error map.
+
+    Normals have the colours (n + 1) / 2, errors those of colour_errors from 0 to TOP_DEG; other pixels are white. The
+    maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
+    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
+
+    The ground truth (H, W, 3) is unit, or zero where there is none; the mask (H, W) is not empty. By method, in the
+    order of the columns, there are normals (H, W, 3) and errors (H, W), NaN where there is no error.
+    """
+    from matplotlib.figure import Figure
+
+    box = bounding_box(mask)
+    height, width = mask[box].shape
+    scale = _scale(height, width, columns=1 + len(normal_maps))
+    truth = _resize(_colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale)
+    normals = {name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()}
+    shown_deg = {name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()}
+    errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
+    captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
+
+    cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
+    text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
+    gap, line = text // 2, 2 * text
+    errors_at = gap + line  # from the bottom, as in matplotlib
+    normals_at = errors_at + cell_height + gap
+    names_at = normals_at + cell_height
+    width, height = gap + (cell_width + gap) * (1 + len(normal_maps)), names_at + 2 * line
+    figure = Figure(figsize=(width / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
+
+    def show(picture: Picture, left: int, bottom: int) -> None:
+        x, y = left + (cell_width - picture.shape[1]) // 2, bottom + (cell_height - picture.shape[0]) // 2
+        figure.figimage(picture[::-1], x, y, origin="lower")
+
+    show(truth, gap, normals_at)
+    _write(figure, gap + cell_width / 2, names_at + text, "ground truth", text)
+    _draw_bar(figure, gap + cell_width, errors_at, cell_height, text)
+    for column, name in enumerate(normal_maps, start=1):
+        left = gap + column * (cell_width + gap)
+        show(normals[name], left, normals_at)
+        show(errors[name], left, errors_at)
+        _write(figure, left + cell_width / 2, names_at + text, name, text)
+        _write(figure, left + cell_width / 2, errors_at - text, captions[name], text)
+    _write(figure, width / 2, height - text, title, _text_height(width, [title], most=round(1.2 * text)))
+    return png_bytes(figure, _MAPS_DPI)
+
+
+def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -> None:
+    """Draw a vertical colour bar of errors with its right edge at `right`, and its labels and title on the left."""
+    inset = text // 2  # room for half a label at either end
+    length = height - 2 * inset
+    column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
+    figure.figimage(colour_errors(column), right - text, bottom + inset, origin="lower")
+    for value, label in TICKS.items():
+        _write(figure, right - 1.4 * text, bottom + inset + value / TOP_DEG * (length - 1), label, text, ha="right")
+    size = _text_height(height, [TITLE], most=text)
+    _write(figure, right - 4 * text, bottom + height / 2, TITLE, size, rotation=90)
+
+
+def _write(
+    figure: Figure, x: float, y: float, words: str, height: int, *, ha: str = "center", rotation: float = 0
+) -> None:
+    """Write text centred at (x, y) in pixels from the bottom left."""
+    from matplotlib.transforms import IdentityTransform
+
+    size, in_pixels = height / _POINT, IdentityTransform()
+    figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
+
+
+def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
+    """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
+    longest = max(18, *(len(line) for line in lines))
+    return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
+
+
+def _scale(height: int, width: int, columns: int) -> float:
+    """Return the factor of enlargement: a whole number, or less than 1."""
+    most = min(_MOST_WIDE / columns / width, _MOST_HIGH / height)
+    return most if most < 1 else max(1, min(int(most), _ENLARGED // max(height, width)))
+
+
+def _resize(picture: Picture, scale: float) -> Picture:
+    if scale >= 1:
+        return picture.repeat(int(scale), axis=0).repeat(int(scale), axis=1)
+    import cv2
+
+    height, width = (max(1, int(side * scale)) for side in picture.shape[:2])
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _colour_normals(normals: Floats, known: Bools) -> Picture:
+    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if NaN is there."""
+    colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
+    colours[~known] = 255
+    return colours

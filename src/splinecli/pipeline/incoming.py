@@ -1,0 +1,169 @@
+"""Captures that come in: films, unpacked into folders of images, and folders, each when it is complete."""
+
+import json
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splinecli.capture.files import digest, natural_key, stamp_content
+from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
+from splinecli.errors import InputError, OutputError, UsageError
+from splinecli.pictures.maps import encode_png
+from splinecli.pipeline.infer_options import Reading
+from splinecli.system.files import read_json
+from splinecli.system.progress import Observer
+from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
+
+FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
+_RECORD = "film.json"
+_FRAME = re.compile(r"frame-\d{6,}\.png")
+
+
+def unpacked(
+    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Literal["nothing", "changed", "all"]
+) -> Path:
+    """Return the capture; of a film, the folder of its frames in `output`, which are taken now or were earlier.
+
+    Args:
+        redo: whether frames of an earlier film are kept, replaced by those of another film, or taken again.
+
+    Raises:
+        UsageError: the lights of a film are not to be found from its images.
+        InputError: the film cannot be read, or its light does not move.
+        OutputError: the folder has frames of another film, or other files, or the frames cannot be written.
+    """
+    if not is_film(capture):
+        return capture
+    if not reading.finds_lights:
+        raise UsageError(f"{capture} is a film, whose lights have to be found", hint="Add --lights estimate")
+    folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
+    refuse_link(folder.parent)
+    refuse_link(folder)
+    with held_folder(folder, observer.warn):
+        of_film, sizes = _earlier(folder)
+        # Other files would count as photographs, or as a mask.
+        known = {*sizes, _RECORD}
+        others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
+        if others and (sizes or not all(map(_FRAME.fullmatch, others))):
+            raise OutputError(
+                f"contains {others[0]}, which is no frame of this film",
+                path=folder,
+                hint="Move it, or choose another -o",
+            )
+        whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
+        if of_film == stamp and whole and redo != "all":
+            return folder
+        if of_film not in (stamp, "") and redo == "nothing":
+            raise OutputError(
+                "contains the frames of another film, or of an earlier version of this one",
+                path=folder,
+                hint="Add --update to take those of this film, or choose another place with -o",
+            )
+        with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
+            numbers = choose_frames(capture)
+            advance(1)
+        names = [f"frame-{number:06}.png" for number in numbers]
+        with new_files(folder, report=_RECORD, stale=sizes) as new:
+            for name, frame in zip(names, read_frames(capture, numbers), strict=True):
+                new.write(name, encode_png(frame, film=True))
+            record = {"film": str(capture), "sha256": stamp, "frames": new.sizes}
+            new.write(_RECORD, json.dumps(record, indent=2) + "\n")
+    return folder
+
+
+def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
+    """Return the stamp of the film whose frames are in the folder, and their sizes; nothing for none."""
+    try:
+        record = read_json(folder / _RECORD)
+        frames = {str(name): int(size) for name, size in record["frames"].items()}
+        if len(frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, frames)):
+            return str(record["sha256"]), frames
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        pass
+    return "", {}
+
+
+Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
+
+
+@dataclass
+class _Seen:
+    """What a folder held, since when it has not changed, and whether it was returned like this."""
+
+    stamp: Stamp
+    since: float
+    returned: bool = False
+
+
+class Arrivals:
+    """The captures in a folder, its subfolders and films, that are complete and were not returned before.
+
+    A capture is complete when it contains a file named `marker`, or, without a marker, and for a film, when nothing in
+    it has changed for `seconds`. Names that begin with a dot are left out, and `without`, such as the folder of the
+    results, which is no capture and lies in none. One that changes after it was returned is returned again. `clock`
+    never goes back.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        marker: str | None,
+        seconds: float,
+        without: Path,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.folder, self.marker, self.seconds = folder, marker, seconds
+        self._left_out = {without.resolve(), *without.resolve().parents}
+        self._clock = clock
+        self._seen: dict[Path, _Seen] = {}
+
+    def take(self) -> list[Path]:
+        """Return the captures that became complete since the last call, in natural order of their names.
+
+        Of two whose results have one name, such as a folder and a film, the second comes with the next call. Raises
+        InputError if the folder cannot be read; later, all captures in it are returned again.
+        """
+        found = {path: _stamp(path) for path in self._captures()}
+        self._seen = {path: seen for path, seen in self._seen.items() if path in found}
+        ready: dict[str, Path] = {}
+        for path, stamp in found.items():
+            seen = self._seen.get(path)
+            if seen is None or seen.stamp != stamp:
+                seen = self._seen[path] = _Seen(stamp, self._clock())
+            if not stamp[0] or seen.returned:
+                continue
+            unchanged = self._clock() - seen.since >= self.seconds
+            by_time = self.marker is None or is_film(path)
+            complete = unchanged if by_time else os.path.exists(path / str(self.marker))  # noqa: PTH110 - never raises
+            name = path.stem if is_film(path) else path.name
+            seen.returned = complete and ready.setdefault(name, path) is path
+        return sorted(ready.values(), key=natural_key)
+
+    def _captures(self) -> list[Path]:
+        try:
+            with os.scandir(self.folder) as entries:
+                visible = [(entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."]
+        except OSError as error:
+            self._seen.clear()  # a capture that was being read has failed, and is to be tried again
+            raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
+        paths = [path for is_dir, path in visible if is_dir or is_film(path)]
+        return [path for path in paths if path.resolve() not in self._left_out]
+
+
+def _stamp(capture: Path) -> Stamp:
+    """Return the stamp of a film, or of all files below a folder. Those that vanish meanwhile do not count."""
+    count = size = newest = 0
+    film = ("", (), [os.fspath(capture)])
+    for place, _, names in [film] if is_film(capture) else os.walk(capture):
+        for name in names:
+            try:
+                status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
+            except OSError:
+                continue
+            count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns, status.st_ctime_ns)
+    return count, size, newest

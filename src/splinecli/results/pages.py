@@ -1,0 +1,335 @@
+"""HTML pages of results: one for each capture, with a view under a movable light, and their overview, index.html."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli import __version__
+from splinecli.capture.files import NORMALS, PAGE, REPORT
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.images import decode_image, image_bytes
+from splinecli.errors import InputError, OutputError
+from splinecli.maths.normals import unit
+from splinecli.pictures.maps import (
+    PREVIEW_LIGHT,
+    TICKS,
+    TOP_DEG,
+    Picture,
+    albedo_picture,
+    colour_errors,
+    confidence_picture,
+    encode_png,
+)
+from splinecli.results.files import read_report
+from splinecli.system.machine import is_out_of_memory
+
+
+def picture_url(file: bytes, kind: str = "png") -> str:
+    """Return a data URL of a PNG or JPEG file, so that a page contains it."""
+    return f"data:image/{kind};base64,{base64.b64encode(file).decode('ascii')}"
+
+
+def render(template: str, **values: object) -> str:
+    """Return the page that a template makes of the values. Values are escaped; a missing value is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("splinecli", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(version=__version__, **values).rstrip() + "\n"
+
+
+LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
+QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page begins with maps of the second
+
+LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
+
+_LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # stands for a component of 1
+_TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
+
+
+def result_page(
+    report: Mapping[str, Any],
+    normal_map: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    *,
+    albedo: NDArray[np.float32] | None = None,
+    confidence_map: NDArray[np.float32] | None = None,
+    error_map_deg: NDArray[np.float32] | None = None,
+    light_plot: bytes | None = None,
+) -> str:
+    """Return one HTML file that contains everything it shows and loads nothing from a network.
+
+    Maps over LARGEST_MAP or LONGEST_SIDE are reduced, with their proportions kept. A pixel of a reduced map is the mean
+    of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit length. The page
+    states its size then. The figures on the page are those of the report, over all pixels. Raises OutputError if a
+    picture cannot be encoded.
+
+    Args:
+        report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths on
+            the page are in millimetres if its surface is, else in pixels of the whole maps.
+        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
+        mask: (H, W), not empty.
+        albedo: (H, W, 3), linear, from albedo_map.
+        confidence_map: (H, W), probabilities.
+        error_map_deg: (H, W) degrees, NaN where there is no error.
+        light_plot: a PNG of the lights, where they were found from the images.
+    """
+    normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
+    maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
+    error_png = None
+    if albedo is not None:
+        maps["albedo"] = albedo_picture(_reduce(albedo, mask, LARGEST_MAP)[0], shown)
+    if confidence_map is not None:
+        reduced = _reduce(confidence_map[..., None], mask, LARGEST_MAP)[0][..., 0]
+        maps["confidence"] = confidence_picture(reduced)
+    if error_map_deg is not None:
+        errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
+        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan)))
+    first = _first_pictures(maps, normals, shown) if shown.size > QUICK_MAP else {}
+    (height, width), size = shown.shape, _size(shown)
+    is_reduced = shown.shape != mask.shape
+    stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None])[0]
+    figures = report["angular_error_deg"]
+    millimetres = (report.get("surface") or {}).get("pixel_size_mm")
+    return render(
+        "page.html",
+        title=report["capture"],
+        report=report,
+        facts=_facts(report, size if is_reduced else None),
+        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all of them."
+        if is_reduced
+        else None,
+        unit="pixels" if millimetres is None else "mm",
+        units_per_pixel=mask.shape[1] / width * (millimetres or 1),
+        errors=[]
+        if figures is None
+        else [
+            ("Mean", f"{figures['mean']:.2f}°"),
+            ("Median", f"{figures['median']:.2f}°"),
+            ("90th percentile", f"{figures['p90']:.2f}°"),
+            ("Under 5°", f"{figures['under_5']:.1%}"),
+            ("Under 10°", f"{figures['under_10']:.1%}"),
+        ],
+        width=width,
+        height=height,
+        light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
+        low_scale=2**LOW_BITS,
+        largest_code=_LARGEST_CODE,
+        first={name: _data_url(picture) for name, picture in first.items()},
+        maps={name: _data_url(picture) for name, picture in maps.items()},
+        error_map=error_png,
+        light_plot=None if light_plot is None else picture_url(light_plot),
+        error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
+        error_ticks=[f"{value:g}°" for value in TICKS],
+    )
+
+
+def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[Picture, Picture]:
+    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the LOW_BITS below.
+
+    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel that is black in
+    the first picture is outside, since no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
+    because a browser would multiply the colours by it.
+    """
+    codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
+    return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
+
+
+def _first_pictures(
+    maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> dict[str, Picture]:
+    """Return the pictures of the maps in few pixels, which a browser shows while it reads the others."""
+    import cv2
+
+    small, known = _reduce(normals, mask, FIRST_MAP)
+    first = dict(zip(("high", "low"), split_normals(unit(small), known), strict=True))
+    for name in maps.keys() - first.keys():
+        reduced = cv2.resize(maps[name], known.shape[::-1], interpolation=cv2.INTER_AREA)
+        first[name] = np.asarray(reduced, np.uint8)
+    return first
+
+
+def _reduce(
+    values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return values (H, W, C) and their mask, reduced to `largest` pixels and sides of LONGEST_SIDE.
+
+    A reduced value is the mean of the known values in its area, and is known if one of them is.
+    """
+    import cv2
+
+    height, width = known.shape
+    shrink = min(LONGEST_SIDE / max(height, width), (largest / known.size) ** 0.5)
+    if shrink >= 1:
+        return values, known
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
+    total = cv2.resize(np.where(known[..., None], values, 0), size, interpolation=cv2.INTER_AREA)
+    total = total.reshape(*weight.shape[:2], -1)  # OpenCV drops an axis of one channel
+    return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
+
+
+def _size(mask: NDArray[np.bool_]) -> str:
+    height, width = mask.shape
+    return f"{width}{_TIMES}{height}"
+
+
+def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
+    """Return terms and values; `reduced` is the size of the page's maps if they were reduced."""
+    weights, expected = report["weights"], report["expected_under_5"]
+    seconds = report["seconds"].items()  # of the stages up to this page
+    condition = "" if report["capture_judged"] else ", if the lights and the images are right"
+    return [
+        ("Method", report["method"]),
+        *([] if weights is None else [("Weights", weights["name"])]),
+        ("Lights", str(report["n_lights"])),
+        ("Pixels", f"{report['n_pixels']:,}"),
+        ("Size", _TIMES.join(map(str, report["image_size"]))),
+        *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
+        *([] if reduced is None else [("Size on this page", reduced)]),
+        ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:g}" for name, n in seconds if n and name != "total")),
+        ("Device", f"{report['device']}, {report['precision']}"),
+    ]
+
+
+def _data_url(picture: Picture) -> str:
+    return picture_url(encode_png(picture))
+
+
+INDEX = "index.html"
+
+THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
+_LARGEST_SHOWN = 10**9  # bytes of a normal map shown small: 33 megapixels of 16 bits; others may be bombs
+_OURS = b'<meta name="generator" content="splinecli">'
+_START = 1 << 16  # bytes of a page, which contain this mark
+
+
+class Row(NamedTuple):
+    """One row of the overview, as text. A capture that failed has only its name and the error."""
+
+    capture: str
+    lights: str = ""
+    pixels: str = ""
+    mae: str = ""
+    likely: str = ""
+    warnings: str = ""
+    seconds: str = ""
+    error: str = ""
+
+
+HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error")
+
+
+class Entry(NamedTuple):
+    """What the page shows of one capture: its row, the names of its files, and its warnings."""
+
+    row: Row
+    files: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Entry:
+        """Return the entry of a report (see report_of), or of a document with `capture` and `error`."""
+        if "error" in report:
+            return cls(Row(report["capture"], error=report["error"]))
+        errors, expected, seconds = report["angular_error_deg"], report["expected_under_5"], report["seconds"]
+        row = Row(
+            report["capture"],
+            lights=str(report["n_lights"]),
+            pixels=f"{report['n_pixels']:,}",
+            mae="" if errors is None else f"{errors['mean']:.2f}°",
+            likely="" if expected is None else f"{expected:.0%}",
+            warnings=str(len(report["warnings"]) or ""),
+            seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
+        )
+        return cls(row, tuple(report["files"]), tuple(str(warning["text"]) for warning in report["warnings"]))
+
+
+def index_page(entries: Sequence[Entry], output: Path) -> str:
+    """Return the page that shows small normal maps and links the files, for the folder of the captures' folders."""
+    rows = []
+    for row, files, words in entries:
+        # As bytes, because a folder's name may not be valid text.
+        folder = quote(os.fsencode(row.capture))
+        picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
+        rows.append(
+            {
+                **row._asdict(),
+                "page": f"{folder}/{PAGE}" if PAGE in files else None,
+                "picture": None if picture is None else f"{folder}/{picture}",
+                "thumbnail": None if picture is None else _thumbnail(output / row.capture / picture),
+                "words": words,
+                "files": [(name, f"{folder}/{quote(name)}") for name in files],
+            }
+        )
+    return render("index.html", title=f"{len(entries)} captures", header=HEADER, rows=rows)
+
+
+def _thumbnail(path: Path) -> str | None:
+    """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None where it cannot be read."""
+    import cv2
+
+    try:
+        if image_bytes(*read_facts(path).size) > _LARGEST_SHOWN:
+            return None
+        picture = decode_image(path)
+    except InputError:
+        return None
+    if picture.dtype.kind != "u":
+        return None
+    height, width = picture.shape[:2]
+    shrink = min(1, THUMBNAIL[0] / width, THUMBNAIL[1] / height)
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) / np.iinfo(picture.dtype).max
+    done, jpeg = cv2.imencode(".jpg", np.rint(255 * small[..., ::-1]).astype(np.uint8))
+    return picture_url(jpeg.tobytes(), "jpeg") if done else None
+
+
+def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
+    """Return the entries, followed by those of other captures that have results in the folder, sorted by name."""
+    names = {entry.row.capture for entry in entries}
+    earlier = []
+    for path in sorted(folder.glob(f"*/{REPORT}")):
+        if path.parent.name in names or path.parent.is_symlink():
+            continue
+        try:
+            entry = Entry.of(read_report(path.parent))
+        except Exception as error:  # a report of somebody else may be wrong in any way
+            if is_out_of_memory(error):
+                raise
+            continue
+        if entry.row.capture == path.parent.name:
+            earlier.append(entry)
+    return [*entries, *earlier]
+
+
+def has_index(folder: Path) -> bool:
+    """Return whether the folder has an index.html that splinecli wrote."""
+    try:
+        if not (folder / INDEX).is_file():
+            return False
+        with (folder / INDEX).open("rb") as file:
+            return _OURS in file.read(_START)
+    except OSError:
+        return False
+
+
+def check_index_free(folder: Path, *, overwrite: bool) -> None:
+    """Raise OutputError if the folder has an index.html that splinecli did not write and may not replace."""
+    path = folder / INDEX
+    if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
+        raise OutputError("was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o")

@@ -1,0 +1,310 @@
+"""The machine: memory, devices, number formats, threads, and optional packages."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Lock
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+from splinecli.errors import SplinecliError, UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+
+_PROBLEMS = {
+    "cluster": "--workers above 1 and --cluster need the package distributed, which is not installed",
+    "exr": "EXR files need the package OpenEXR, which is not installed",
+    "mesh": "--decimate needs the package fast-simplification, which is not installed",
+    "raw": "camera RAW files need rawpy, which is not installed",
+    "render": "rendering needs embreex and scikit-image, which are not all installed",
+    "tensorboard": "--tensorboard needs the package tensorboard, which is not installed",
+}
+"""The message for each extra."""
+
+
+def import_extra(
+    module: str,
+    extra: str,
+    *,
+    error: type[SplinecliError] = UsageError,
+    path: Path | None = None,
+    otherwise: str | None = None,
+) -> ModuleType:
+    """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
+
+    Raises UsageError or `error` if the module is not installed. The message names the command that installs it, the
+    file at `path` that cannot be read without it, and `otherwise`, another way out.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as cause:
+        alternative = f", or {otherwise}" if otherwise else ""
+        raise error(_PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}") from cause
+
+
+LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
+_LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of malloc.h
+_LARGEST_KEPT, _MOST_KEPT = 2**27, 2**29  # bytes
+_NO_MEMORY = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
+_GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+_MOUNT = Path("/sys/fs/cgroup")
+_GROUP_FILES = (  # the limit, the use, and the file cache within it
+    ("memory.max", "memory.current", "inactive_file"),  # version 2
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
+)
+
+
+def available_memory() -> float:
+    """Return the bytes of memory that this process may still use; infinity where the system does not say.
+
+    It is the least of the machine's free memory, the limits of the process's control groups, and the limit on its
+    address space (ulimit -v).
+    """
+    in_groups = map(_left_in_group, own_groups("memory"))
+    return min(_free_memory(), _left_in_address_space(), *in_groups)
+
+
+def own_groups(controller: str) -> Iterator[Path]:
+    """Yield the folders of this process's control groups that limit `controller`, cpu or memory, and of those above."""
+    try:
+        lines = _GROUPS.read_text("utf-8").splitlines()
+    except OSError:
+        return  # not Linux
+    for line in lines:
+        _, controllers, group = line.split(":", 2)
+        if controllers and controller not in controllers.split(","):
+            continue
+        top = _MOUNT / controllers
+        if not top.is_dir():
+            top = _MOUNT / controller
+        folder = top / group.lstrip("/")
+        # Inside a container the path may be that of the host, which does not exist here. The top always does.
+        for place in (folder, *folder.parents):
+            yield place
+            if place == top:
+                break
+
+
+def check_address_space() -> None:
+    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low to load the numerical libraries.
+
+    Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
+    """
+    needed = _LIBRARIES + _BUFFER * (os.cpu_count() or 1)
+    if (most := _address_space_limit()) < needed:
+        raise SplinecliError(
+            f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v), but at least"
+            f" {needed / 1e9:.1f} GB are needed",
+            hint="Raise the limit",
+        )
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep freed blocks for the next arrays, where it is glibc.
+
+    By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
+    third of the time of networks and of reading. Blocks above _LARGEST_KEPT are still returned.
+    """
+    mallopt = _of_c_library("mallopt")
+    for parameter, n_bytes in ((_MMAP_THRESHOLD, _LARGEST_KEPT), (_TRIM_THRESHOLD, _MOST_KEPT)):
+        mallopt(parameter, n_bytes)
+
+
+def return_freed_memory() -> None:
+    """Return freed blocks to the system between two stages, where the C library is glibc; see keep_freed_memory."""
+    _of_c_library("malloc_trim")(0)
+
+
+def _of_c_library(name: str) -> Callable[..., object]:
+    """Return a function of the C library, or one that does nothing where there is none of this name."""
+    try:
+        import ctypes
+
+        found: Callable[..., object] = getattr(ctypes.CDLL(None), name)
+    except (ImportError, OSError, AttributeError, TypeError):  # another C library, or Windows
+        return lambda *_: None
+    return found
+
+
+def _free_memory() -> float:
+    return 1024 * _value_after("MemAvailable:", Path("/proc/meminfo"), math.inf)
+
+
+def _left_in_group(folder: Path) -> float:
+    """Return what the limit of a control group leaves. The group's file cache can be freed.
+
+    Without a limit it is infinity or, in version 1, a huge number.
+    """
+    for limit, use, cache in _GROUP_FILES:
+        try:
+            most, used = (int((folder / name).read_text("utf-8")) for name in (limit, use))
+        except (OSError, ValueError):  # the other version, or the limit "max"
+            continue
+        return most - used + _value_after(cache, folder / "memory.stat", 0)
+    return math.inf
+
+
+def _address_space_limit() -> float:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.inf
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return math.inf if most == resource.RLIM_INFINITY else most
+
+
+def _left_in_address_space() -> float:
+    return _address_space_limit() - 1024 * _value_after("VmSize:", Path("/proc/self/status"), 0)
+
+
+def _value_after(name: str, path: Path, otherwise: float) -> float:
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except OSError:  # not Linux
+        return otherwise
+    return next((float(line.split()[1]) for line in lines if line.startswith(name)), otherwise)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that there is no memory left, in Python, PyTorch or the loading of a library."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or (
+        isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
+    )
+
+
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+def choose_device(name: Device | str) -> torch.device:
+    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises UsageError."""
+    if name not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
+    import torch
+
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise UsageError("no CUDA device was found", hint="Use --device cpu or auto")
+    return torch.device("cuda" if available and name != "cpu" else "cpu")
+
+
+def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
+    """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
+    if name != "auto":
+        return name
+    import torch
+
+    if device.type == "cuda":
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:  # a CPU without the instructions emulates bfloat16, which is slower than float32
+        found = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+        native = bool(found.get("avx512_bf16") or found.get("amx_bf16") or found.get("bf16"))
+    return "bfloat16" if native else "float32"
+
+
+def use_available_cores() -> None:
+    """Limit PyTorch's threads to the cores that this process may use.
+
+    Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
+    may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
+    ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
+    """
+    import torch
+
+    if (cores := count_available_cores()) < torch.get_num_threads():
+        torch.set_num_threads(cores)
+
+
+def count_available_cores() -> int:
+    """Return the number of cores that this process may use, at least 1.
+
+    It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its control group, which
+    containers and job schedulers set (Linux).
+    """
+    limits = [os.cpu_count() or 1, *cgroup_quotas()]
+    if hasattr(os, "sched_getaffinity"):
+        limits.append(len(os.sched_getaffinity(0)))
+    return max(1, int(min(limits)))
+
+
+def cgroup_quotas() -> list[float]:
+    """Return the CPU quotas, in cores, of this process's control groups and of the groups above them."""
+    quotas = []
+    for folder in own_groups("cpu"):
+        # Quota and period in microseconds: in one file of version 2, or in two of version 1. The first is "max" or -1
+        # where there is none.
+        for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
+            with suppress(OSError):
+                quota, period = " ".join((folder / name).read_text("utf-8") for name in names).split()
+                quotas += [] if quota in ("max", "-1") else [float(quota) / float(period)]
+    return quotas
+
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+_lock, _users, _threads = Lock(), 0, 0
+
+
+@contextmanager
+def one_thread_each() -> Iterator[int]:
+    """Let each operation of PyTorch use one thread only. Yields the number of threads that it used before.
+
+    Operations on small arrays are hardly faster on more, and on a busy machine many times as slow, because all threads
+    of an operation wait for the slowest.
+    """
+    import torch
+
+    global _users, _threads
+    # Each thread has its own number, and new ones have the number that was set last. So the first of several callers
+    # reads it for all, and each sets it in its own thread.
+    with _lock:
+        if not _users:
+            _threads = torch.get_num_threads()
+        _users += 1
+        threads = _threads
+        torch.set_num_threads(1)
+    try:
+        yield threads
+    finally:
+        with _lock:
+            _users -= 1
+            torch.set_num_threads(threads)
+
+
+def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
+    """Yield function(part) of each part, in order, computed without gradients on as many threads as PyTorch uses.
+
+    Within the function, each operation of PyTorch uses one thread. At most one result more than there are threads is
+    kept. An error is raised when the turn of its part comes.
+    """
+    import torch
+
+    def compute(part: Part) -> Result:
+        with torch.inference_mode():
+            return function(part)
+
+    waiting: deque[Future[Result]] = deque()
+    with one_thread_each() as threads:
+        # Each new thread has the number of threads of OpenMP, until PyTorch sets its own.
+        pool = ThreadPoolExecutor(threads, "part", lambda: torch.set_num_threads(1))
+        try:
+            for part in parts:
+                waiting.append(pool.submit(compute, part))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)

@@ -1,0 +1,252 @@
+"""Light files: every accepted way of writing one, as people have them, and the message for every wrong one."""
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from splinecli.capture import read_light_directions, read_light_intensities
+from splinecli.capture.light_files import NamedLights, read_lights
+from splinecli.errors import InputError
+
+DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
+ROWS = ["0 0 1", "0.6 0 0.8", "0 -0.6 0.8", "-0.48 0.36 0.8"]
+
+
+def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
+    path = folder / "lights.txt"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+FORMS = {
+    "rows": "\n".join(ROWS),
+    "crlf": "\r\n".join(ROWS) + "\r\n\r\n",
+    "count": "4\n" + "\n".join(ROWS),
+    "comments": "# x y z\n\n" + "\n\n".join(row + "  # a light" for row in ROWS),
+    "tabs": "\n".join(ROWS).replace(" ", "\t"),
+    "commas": "\n".join(ROWS).replace(" ", ", "),
+    "semicolons": "\n".join(ROWS).replace(" ", ";"),
+    "mixed": "0 0 2\n3,0,4\n0;\t-6e-1; 0.8,\n-0.48\t0.36 , 0.8",
+    "transposed": "0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
+    "count-transposed": "4\n0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_directions(tmp_path: Path, form: str) -> None:
+    for n_images, encoding in ((None, "utf-8"), (4, "utf-8"), (None, "utf-8-sig"), (4, "utf-8-sig")):
+        directions = read_light_directions(write(tmp_path, FORMS[form], encoding), n_images)
+        assert directions.dtype == np.float64
+        np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
+
+
+def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> None:
+    directions = read_light_directions(write(tmp_path, "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1"))
+    np.testing.assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
+
+
+@settings(deadline=None)
+@given(
+    vectors=st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)), min_size=4, max_size=12),
+    separator=st.sampled_from([" ", "\t", ",", ";", " ,\t", " ; "]),
+    counted=st.booleans(),
+    transposed=st.booleans(),
+)
+def test_directions_round_trip(vectors, separator, counted, transposed):
+    values = np.array(vectors)
+    rows = [separator.join(repr(float(v)) for v in row) for row in (values.T if transposed else values)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
+        directions = read_light_directions(path, len(values))
+    expected = values / np.linalg.norm(values, axis=1, keepdims=True)
+    np.testing.assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
+
+
+COMMA = "A comma separates columns; write decimals with a point."
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("0 0 1\n\n0 1\n0 1 1", 3, "found 2 columns, expected 3 as in the other lines"),
+        ("0 0 1 1\n" * 5, 1, "found 4 columns, expected 3 (x y z)"),
+        ("0,1,0,2,0,9\n" * 5, 1, f"found 6 columns, expected 3 (x y z). {COMMA}"),
+        ("0.1 0.2 1\n0,1 0,2 1\n0.1 0.2 1", 2, f"found 5 columns, expected 3 as in the other lines. {COMMA}"),
+        ("0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1", 2, "found 4 columns, expected 3 as in the other lines"),
+        ("# lights\n0 0 1\n0 one 1", 3, 'found "one", expected a number'),
+        ("0 0 1\n0 1_0 1", 2, 'found "1_0", expected a number'),
+        ("0 0 1\n0 1e999 1", 2, 'found "1e999", expected a finite number'),
+        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, "found a light below the horizon in column 4 (z = 0), expected z > 0"),
+        ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line says 5, but 4 rows follow"),
+        ("0.5\n0 0 1\n0 1 1", 1, "found 1 column, expected 3 columns or a count"),
+        ("0 0 1\n0 1 1\n1 0 1", None, "found 3 light directions, expected 5, one for each image"),
+        ("# nothing\n", None, "the file contains no numbers"),
+    ],
+)
+def test_wrong_directions(tmp_path: Path, text: str, line: int | None, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        read_light_directions(path, 5 if line is None else None)
+    assert str(caught.value).startswith(f"{path}: {message}" if line is None else f"{path}:{line}: {message}")
+    assert (caught.value.path, caught.value.line) == (path, line)
+
+
+def test_files_that_are_no_text(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
+    write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1")
+    for name, message in (
+        ("none.txt", r"none\.txt: the file does not exist\."),
+        (".", r"found a folder, expected a text file with a line x y z for"),
+        ("lights.txt", r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."),
+        ("mask.png", r"found an image, expected a text file with a line x y z for each image\."),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_light_directions(tmp_path / name)
+    with pytest.raises(InputError, match=r"expected a text file with a line r g b for each image\."):
+        read_light_intensities(tmp_path / "mask.png", 3)
+
+
+COLOURED = ("1 2 4\n2 2 2\n1 1 1\n3 3 3", "4\n1,2,4\n2,2,2\n1,1,1\n3,3,3", "1 2 1 3\n2 2 1 3\n4 2 1 3")
+GRAY = ("3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5")
+
+
+@pytest.mark.parametrize("text", COLOURED + GRAY)
+def test_intensities(tmp_path: Path, text: str) -> None:
+    """In rows, after a count, or in columns; gray ones count for every channel."""
+    expected = [[3] * 3, [1] * 3, [2] * 3, [5] * 3] if text in GRAY else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
+    np.testing.assert_array_equal(read_light_intensities(write(tmp_path, text), 4), expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 1 1\n1 0 1\n1 1 1\n1 1 1", ":2: found the intensity 0, expected a number above 0."),
+        ("1 1 1 1\n1 1 -2 1\n1 1 1 1", ":2: found the intensity -2 in column 3, expected a number above 0."),
+        ("1 1\n1 1\n1 1\n1 1", ":1: found 2 columns, expected 3 (R G B) or 1 (gray)."),
+        ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", ':2: found "inf", expected a finite number.'),
+        ("1 1 1\n1 1 1", ": found 2 light intensities, expected 4, one for each image."),
+        ("1 1 1\n1 1e308 1\n1 1 1\n1 1 1", ":2: found the intensity 1e+308, expected a number from 1e-12 to"),
+    ],
+)
+def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        read_light_intensities(path, 4)
+    assert str(caught.value).startswith(f"{path}{message}")
+
+
+IMAGES = tuple(Path(f"img{number}.png") for number in (1, 2, 3, 10))
+
+
+PLAIN = {
+    "header": ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
+    "utf-16": ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
+    "decimal-commas": ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
+    "commas-and-semicolons": ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
+    "counted-from-1": ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
+    "z-first": ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
+    "y-first": ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
+    "counted-from-0": ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
+}
+
+
+@pytest.mark.parametrize("form", PLAIN)
+def test_plain_files(tmp_path: Path, form: str) -> None:
+    text, encoding = PLAIN[form]
+    path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
+    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-15)
+
+
+@pytest.mark.parametrize("n_images", [None, 4])
+def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | None) -> None:
+    # The first column, 1 3 2, would count three lights.
+    path = write(tmp_path, "1 0 0 1\n3 1 0 0\n2 1 1 1")
+    expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
+    expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(read_light_directions(path, n_images), expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0.8",
+        'C:\\shoot\\img3.PNG 0 -0,6 0,8\n"img2.png" 0,6 0 0,8\nimg1.png 0 0 1\nimg10.png -0,48 0,36 0,8',
+        "name z y x\nimg1 1 0 0\nimg2 0.8 0 0.6\nimg3 0.8 -0.6 0\nimg10 0.8 0.36 -0.48",
+        "4\nimg1 0 0 1\nimg2 0.6 0 0.8\nimg3 0 -0.6 0.8\nimg10 -0.48 0.36 0.8",
+    ],
+    ids=["csv", "paths", "header", "stems"],
+)
+@pytest.mark.parametrize("stem", ["img", "2024_0"])
+def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> None:
+    """A name such as 2024_01, which Python would read as a number, is a name."""
+    text = text.replace("img", stem)
+    lights = read_lights(write(tmp_path, text), 4)
+    assert isinstance(lights, NamedLights)
+    wanted = [Path(image.name.replace("img", stem)) for image in IMAGES]
+    images, how = lights.match(wanted)
+    assert how.startswith("name")
+    found = dict(zip(images, lights.directions, strict=True))
+    np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
+
+
+@pytest.mark.parametrize("vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"])
+def test_arrays(tmp_path: Path, vectors: np.ndarray) -> None:
+    np.save(tmp_path / "lights.npy", vectors)
+    np.testing.assert_allclose(read_light_directions(tmp_path / "lights.npy", 4), DIRECTIONS, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
+        (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
+        (np.array({"a": 1}, object), "is damaged, or contains no array of numbers"),
+        (np.ones((5, 3)), "found 5 light directions, expected 4"),
+    ],
+)
+def test_refused_arrays(tmp_path: Path, array: np.ndarray, message: str) -> None:
+    np.save(tmp_path / "lights.npy", array, allow_pickle=True)
+    with pytest.raises(InputError, match=message):
+        read_light_directions(tmp_path / "lights.npy", 4)
+
+
+@pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
+def test_angles(tmp_path: Path, text: str | None) -> None:
+    # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
+    counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
+    directions = read_light_directions(write(tmp_path, text or counted), 4, form="azel")
+    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 90\n30 45\n120 45\n240 45", "2 columns of angles, expected 3 columns"),
+        ("1 0 90\n2 30 45\n3 120 45\n4 240 45", "a number and two angles, expected 3 columns"),
+        ("0 30 1\n90 40 1\n180 45 1\n270 30 1", "azimuth, elevation and 1, expected x y z.*Leave the third"),
+        ("a.png 0 30\nb.png 90 40\nc.png 180 45", "a name and 2 numbers"),
+    ],
+)
+def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"found {message}.*add --lights-format azel"):
+        read_lights(write(tmp_path, text), text.count("\n") + 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
+        ("30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
+        ("0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians.*57.2958"),
+        ("azimuth zenith\n30 45\n120 40\n240 45", r':1: found the column "zenith".*90 minus the angle'),
+        ("0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
+    ],
+)
+def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_light_directions(write(tmp_path, text), form="azel")

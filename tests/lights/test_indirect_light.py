@@ -1,0 +1,203 @@
+"""Light from other parts of the object: a spherical bowl, in which it is known exactly.
+
+Two parts of a sphere's inside exchange the same share of light wherever they are. So in a matte bowl of radius R, all
+places receive the same indirect light, sum(B dA) / (4 pi R^2), where B is what the places send.
+"""
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from scenes import directions_at
+from splinecli import inference
+from splinecli.capture import Capture
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.inference import estimate_normals
+from splinecli.lights.indirect_light import IndirectLight, find_indirect_light
+from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.maths.normals import angle_between_deg
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.methods.batched import NetworkEstimator
+from splinecli.networks.refine_net import channels
+from splinecli.refinement.refiner import NetworkRefiner
+from splinecli.system.progress import Progress
+from splinecli.training.refinement import pixel_features
+
+SIZE = 64
+AZIMUTH = np.arange(10) * np.radians(36)
+ZENITH = np.radians(np.where(np.arange(10) % 2, 35, 60))
+LIGHTS = directions_at(AZIMUTH, ZENITH)
+ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
+X, Y = (COLUMNS - (SIZE - 1) / 2) / (SIZE / 2), ((SIZE - 1) / 2 - ROWS) / (SIZE / 2)
+MASK = X**2 + Y**2 < 0.9**2
+OUTWARDS = np.stack((X, Y, np.sqrt((1 - X**2 - Y**2).clip(0))), axis=-1)[MASK]
+"""The normals of a ball. Those of a bowl have the opposite x and y."""
+BOWL = OUTWARDS * (-1, -1, 1)
+ALBEDO = np.where((ROWS // 8 + COLUMNS // 8) % 2, 0.9, 0.3)[MASK][:, None]
+SHARE = 1 / OUTWARDS[:, 2:] / (4 * np.pi * (SIZE / 2) ** 2)
+"""The share (P, 1) of each pixel in the area of the whole sphere."""
+EVERYWHERE = np.arange(len(BOWL))
+INSIDE = np.hypot(X, Y)[MASK] < 0.8
+"""The pixels but for the rim, which lies between a block and none."""
+
+Floats = NDArray[np.float32]
+
+
+def direct_and_indirect(
+    normals: NDArray[np.floating],
+    directions: NDArray[np.floating] = LIGHTS,
+    strengths: NDArray[np.floating] | float = 1.0,
+) -> tuple[Floats, Floats]:
+    """Return the light (P, F) that a checkered matte bowl reflects from the lamps, and from itself."""
+    cosines = (normals[:, None] * directions).sum(-1).clip(0)
+    direct = ALBEDO * cosines * strengths
+    arriving = (SHARE * direct).sum(axis=0) / (1 - (SHARE * ALBEDO).sum())
+    return direct.astype(np.float32), (ALBEDO * arriving).astype(np.float32)
+
+
+DIRECT, INDIRECT = direct_and_indirect(BOWL)
+CAPTURE = Capture("bowl", DIRECT + INDIRECT, LIGHTS, tuple(range(10)), MASK)
+
+
+def found_in(
+    normals: NDArray[np.floating], observations: Floats, lights: NDArray[np.floating] = LIGHTS
+) -> IndirectLight | None:
+    return find_indirect_light(
+        MASK, observations, lambda rows: LampLight(observations[rows], lights), normals.astype(np.float32)
+    )
+
+
+def test_a_bowls_light_on_itself_is_found_at_any_exposure() -> None:
+    direct, indirect = 5 * DIRECT, 5 * INDIRECT
+    found = found_in(BOWL, direct + indirect)
+    ratio = (found.at(EVERYWHERE) / indirect)[INSIDE]
+    assert ratio.mean() == pytest.approx(1, abs=0.05)
+    assert ratio.std() < 0.05
+    left = found.remove(direct + indirect, EVERYWHERE)
+    assert np.abs(left - direct)[INSIDE].mean() < 0.1 * indirect.mean()
+
+
+@pytest.mark.parametrize("camera_matrix", [None, np.array(((200, 0, 31.5), (0, 200, 31.5), (0, 0, 1.0)))])
+def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None) -> None:
+    points = np.stack((X[MASK], Y[MASK], -BOWL[:, 2]), axis=1)
+    points[:, 2] -= points[:, 2].mean()
+    distances = np.where(np.arange(10) % 2, 3.0, 2.0)[:, None]
+    lamps = NearLamps.of(distances * LIGHTS, 2 / SIZE, (SIZE, SIZE), equal=False, camera_matrix=camera_matrix)
+    lamps = replace(lamps, points=points.astype(np.float32))
+    direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
+    seen = direct + indirect
+
+    def light_of(rows: NDArray[np.integer]) -> LampLight:
+        return LampLight.of(seen[rows], lamps.choose_pixels(rows))
+
+    found = find_indirect_light(MASK, seen, light_of, BOWL.astype(np.float32))
+    assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.05)
+
+
+def test_a_dark_background_changes_nothing() -> None:
+    alone = found_in(BOWL, DIRECT + INDIRECT)
+    mask = np.ones((640, 640), np.bool_)
+    normals = np.tile(np.array((0, 0, 1), np.float32), (*mask.shape, 1))
+    observations = np.full((*mask.shape, 10), 0.002, np.float32)
+    place = np.zeros_like(mask)
+    place[320:384, 320:384] = MASK
+    normals[place], observations[place] = BOWL, DIRECT + INDIRECT
+    normals, observations = normals[mask], observations[mask]
+    found = find_indirect_light(mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals)
+    ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
+    assert ratio[INSIDE].mean() == pytest.approx(1, abs=0.05)
+
+
+def test_a_ball_receives_none_even_with_ambient_light() -> None:
+    direct = direct_and_indirect(OUTWARDS)[0]
+    assert found_in(OUTWARDS, direct) is None
+    assert found_in(OUTWARDS, direct + np.float32(0.05)) is None
+
+
+def test_ambient_light_is_separated_from_indirect_light() -> None:
+    found = found_in(BOWL, DIRECT + INDIRECT + (0.03 * ALBEDO).astype(np.float32))
+    assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == pytest.approx(1, abs=0.15)
+
+
+def test_nothing_is_removed_where_shadows_do_not_show_it() -> None:
+    """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow something else."""
+    assert found_in(BOWL, DIRECT) is None
+    noise = np.random.default_rng(0).random(DIRECT.shape, np.float32) / ALBEDO.astype(np.float32)
+    assert found_in(BOWL, np.where(DIRECT > 0, DIRECT, INDIRECT * noise)) is None
+    assert found_in(BOWL, np.zeros_like(DIRECT)) is None
+
+
+def test_no_more_is_removed_than_the_brightest_albedo_allows() -> None:
+    found = found_in(BOWL, DIRECT + 20 * INDIRECT)
+    assert 1.3 < found.albedo.max() < 1.6
+
+
+def test_few_pixels_lose_what_is_negligible() -> None:
+    found = found_in(BOWL, DIRECT + INDIRECT)
+    assert found.counts_at(DIRECT + INDIRECT, EVERYWHERE)[INSIDE].all()
+    assert not found.counts_at(100 * (DIRECT + INDIRECT), EVERYWHERE).any()
+
+
+def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
+    estimator = make_estimator("spline-net")
+
+    def mean_error_deg() -> float:
+        found = estimate_normals(CAPTURE, estimator).normal_map[MASK]
+        return float(angle_between_deg(found, BOWL).mean())
+
+    without = mean_error_deg()
+    with patch.object(inference, "find_indirect_light", return_value=None):
+        assert without < 0.6 * mean_error_deg()
+
+
+def test_the_refinement_sees_what_is_left() -> None:
+    stages = []
+
+    def stage(name: str) -> AbstractContextManager[Progress]:
+        stages.append([name, 0])
+
+        def count(pixels: int) -> None:
+            stages[-1][1] += pixels
+
+        return nullcontext(count)
+
+    def refine(_: NetworkRefiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object) -> None:
+        seen.append(light_of(EVERYWHERE).observations)
+
+    seen: list[Floats] = []
+    with patch.object(NetworkRefiner, "refine", refine):
+        estimate_normals(CAPTURE, make_estimator("spline-net"), stage=stage)
+    assert np.abs(seen[0] - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
+    assert stages == [["removing indirect light", len(BOWL)], ["refining", 0]]
+
+
+def test_the_capture_is_seen_anew_without_its_own_light() -> None:
+    seen, look = [], NetworkEstimator.for_capture
+
+    def for_capture(estimator: NetworkEstimator, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+        seen.append(light_of(EVERYWHERE).observations)
+        return look(estimator, light_of, n_pixels)
+
+    with patch.object(NetworkEstimator, "for_capture", for_capture):
+        estimate_normals(CAPTURE, make_estimator("spline-net"))
+    before, after = seen
+    np.testing.assert_array_equal(before, CAPTURE.observations)
+    assert np.abs(after - DIRECT)[INSIDE].mean() < 0.3 * INDIRECT[INSIDE].mean()
+
+
+def test_the_refinement_net_learns_from_what_it_sees_in_use() -> None:
+    estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
+    features = pixel_features(
+        estimator.network, torch.from_numpy(CAPTURE.observations), torch.from_numpy(LIGHTS).float(), torch.tensor(MASK)
+    )
+    with patch.object(NetworkRefiner, "refine"):
+        in_use = estimate_normals(CAPTURE, estimator).normal_map[MASK]
+    learned_from = features[:, channels("normal")].numpy()
+    assert angle_between_deg(learned_from, in_use).max() < 0.1
+    with_indirect = estimator.estimate(CAPTURE.observations, LIGHTS)
+    assert angle_between_deg(learned_from, with_indirect).mean() > 1

@@ -1,0 +1,214 @@
+"""Lights that are found from the images: analytic spheres, whose lights are known."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from scenes import cap_directions, shade, sphere, sphere_cap
+from splinecli import estimate_normals
+from splinecli.capture_warnings import ESTIMATED_LIGHTS
+from splinecli.confidence import add_common_error
+from splinecli.errors import InputError, UsageError
+from splinecli.lights import unknown_lights
+from splinecli.lights.light_fit import fit_near
+from splinecli.lights.unknown_lights import OutlineTurn, find_lights, outline_share, turn_at_outline
+from splinecli.maths.normals import angle_between_deg
+
+SIZE = 64
+NORMALS, INSIDE = sphere(SIZE)
+
+
+def lights(count: int = 10, seed: int = 1) -> NDArray[np.float64]:
+    return cap_directions(count, 55, seed, even=True)
+
+
+def observed(directions: NDArray[np.float64], **gloss: float) -> NDArray[np.float32]:
+    return shade(NORMALS[INSIDE], directions, noise=0.002, **gloss).astype(np.float32)
+
+
+def images_of(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    images = np.zeros((len(observations.T), SIZE, SIZE), np.float32)
+    images[:, INSIDE] = observations.T
+    return images
+
+
+def mean_angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    return float(angle_between_deg(found, true).mean())
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@pytest.mark.parametrize("count", [4, 10, 40])
+def test_a_sphere(count: int, gloss: float) -> None:
+    true = lights(count)
+    found = find_lights(observed(true, gloss=gloss), INSIDE, True)
+    assert found.intensities is None
+    assert mean_angle(found.directions, true) < 5
+    assert mean_angle(found.directions, true) < 3 * found.errors_deg.mean()
+    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
+
+
+def test_intensities_are_found_with_the_directions() -> None:
+    true, intensities = lights(), np.random.default_rng(3).uniform(0.7, 1.4, 10)
+    intensities /= intensities.mean()
+    found = find_lights(observed(true) * intensities.astype(np.float32), INSIDE, False)
+    assert found.intensities is not None and found.intensities.mean() == pytest.approx(1)
+    assert mean_angle(found.directions, true) < 6
+    assert np.abs(found.intensities / intensities - 1).mean() < 0.5 * np.abs(intensities - 1).mean()
+
+
+def test_the_number_of_threads_changes_nothing() -> None:
+    """Rounding alone could move a light into another cell of an observation map."""
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(find_lights(observed(lights()), INSIDE, True).directions)
+    finally:
+        torch.set_num_threads(before)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+
+
+def test_a_turned_camera_turns_the_lights() -> None:
+    """All eight turns and mirror images are seen, so none is preferred."""
+    true = lights()
+    images = images_of(observed(true, gloss=0.3))
+    inside = INSIDE.copy()
+    inside[: SIZE // 4] = False  # no symmetric outline
+    straight = find_lights(np.ascontiguousarray(images[:, inside].T), inside, True)
+    turned, turned_inside = np.rot90(images, axes=(1, 2)), np.rot90(inside).copy()
+    found = find_lights(np.ascontiguousarray(turned[:, turned_inside].T), turned_inside, True)
+    x, y, z = straight.directions.T
+    # The sample of pixels that the lights are fitted to differs a little.
+    assert mean_angle(found.directions, np.stack((-y, x, z), axis=1)) < 0.2
+
+
+def test_what_shows_no_object_is_refused() -> None:
+    n_pixels, rng = int(INSIDE.sum()), np.random.default_rng(0)
+    normals, disc = sphere(400)
+    ring = disc & ~sphere(400, 0.96)[1]
+    for observations, mask, message in (
+        (np.repeat(observed(lights(1)), 6, axis=1) * np.linspace(0.5, 1, 6), INSIDE, "all images are alike"),
+        (np.zeros((n_pixels, 8)), INSIDE, "all images are alike"),
+        (rng.uniform(size=(n_pixels, 8)), INSIDE, "do not show one surface"),
+        (shade(normals[ring], lights()), ring, "the mask is too thin"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_lights(observations.astype(np.float32), mask, True)
+
+
+def test_a_first_light_from_another_side_decides_nothing() -> None:
+    true = lights()
+    true[0] = (0.0, 0.6, 0.8)
+    with pytest.raises(InputError, match=r"does not come clearly from left.* --first-light 45"):
+        find_lights(observed(true), INSIDE, True, first_light="left")
+    found = find_lights(observed(true), INSIDE, True, first_light="above")
+    assert mean_angle(found.directions, true) < 5
+
+
+@pytest.mark.parametrize(("side", "azimuth_deg"), [("upper-right", 45), ("90", 90), ("lower-left", 225), ("-45", 315)])
+def test_the_first_light_may_come_from_any_direction(side: str, azimuth_deg: float) -> None:
+    true = lights()
+    azimuth = np.radians(azimuth_deg)
+    true[0] = (0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), 0.8)
+    found = find_lights(observed(true), INSIDE, True, first_light=side)
+    assert mean_angle(found.directions, true) < 5
+    with pytest.raises(UsageError, match=r"expected one of right, upper-right, .* or its azimuth in degrees"):
+        find_lights(observed(true), INSIDE, True, first_light=side + "x")
+
+
+def test_holes_and_narrow_borders_are_no_outline() -> None:
+    mask = np.ones((200, 200), np.bool_)
+    mask[80:120, 80:120] = False
+    assert outline_share(mask) == 0
+    mask[:2] = mask[-2:] = mask[:, :2] = mask[:, -2:] = False
+    assert outline_share(mask) == 0
+    assert outline_share(INSIDE) > 0.9
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow: bool) -> None:
+    """A matte hollow shows the same as a bump under opposite lights."""
+    everywhere, true = np.ones((SIZE, SIZE), np.bool_), lights()
+    true[0] = (-0.6, 0.0, 0.8)
+    normals = sphere_cap(SIZE).reshape(-1, 3) * ((-1, -1, 1) if hollow else (1, 1, 1))
+    images = shade(normals, true, noise=0.002).astype(np.float32)
+    with pytest.raises(InputError, match=r"a bump looks like a hollow .* add --auto-mask\. .* --first-light left"):
+        find_lights(images, everywhere, True)
+    found = find_lights(images, everywhere, True, first_light="left")
+    assert mean_angle(found.directions, true) < 6
+
+
+def test_the_images_correct_guesses_that_disagree_with_each_other() -> None:
+    """A matte surface cannot tell a common turn, but nearly all of the rest."""
+    true = lights(12)
+    guessed = true + np.random.default_rng(2).normal(scale=0.06, size=true.shape)
+    guessed /= np.linalg.norm(guessed, axis=1, keepdims=True)
+    fit = fit_near(observed(true), guessed, np.full(12, 5.0), intensity_error=0.0, worth_pixels=50)
+    assert fit is not None and fit.after < 0.5 * fit.before
+
+    def without_common_turn(directions: NDArray[np.float64]) -> float:
+        turn, _ = Rotation.align_vectors(true, directions)
+        return mean_angle(turn.apply(directions), true)
+
+    assert without_common_turn(fit.directions) < 0.4 * without_common_turn(guessed)
+
+
+@pytest.mark.parametrize("turn_deg", [(8, 0, 0), (0, -6, 0), (3, 4, 5)])
+def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -> None:
+    true = lights(20)
+    turn = Rotation.from_rotvec(turn_deg, degrees=True)
+    found = turn_at_outline(observed(true), INSIDE, turn.apply(true))
+    assert found is not None and found.spread < 0.1
+    shown = Rotation.from_rotvec(found.rotation)
+    left = (shown * turn).magnitude()
+    assert np.degrees(left) < 0.35 * np.linalg.norm(turn_deg)
+    half = Rotation.from_matrix(found.share(0.5))
+    assert half.magnitude() == pytest.approx(shown.magnitude() / 2)
+
+
+def test_the_border_of_the_image_is_no_outline() -> None:
+    everywhere = np.ones((SIZE, SIZE), np.bool_)
+    values = shade(sphere_cap(SIZE)[everywhere], lights()).astype(np.float32)
+    assert turn_at_outline(values, everywhere, lights()) is None
+
+
+def test_confidence_includes_the_lights() -> None:
+    errors = np.array([[np.log(0.03), 1.0], [np.log(0.5), 1.0]], np.float32)
+    add_common_error(errors, 3.0)
+    turn = np.radians(3.0)
+    np.testing.assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
+
+
+def test_python() -> None:
+    true = lights()
+    images = images_of(observed(true))
+    estimate = estimate_normals(images, None, INSIDE, method="ls")
+    capture = estimate.capture
+    assert ESTIMATED_LIGHTS in [warning.code for warning in capture.warnings]
+    assert capture.light_errors_deg is not None and capture.light_errors_deg.shape == (10,)
+    errors = angle_between_deg(estimate.normal_map[INSIDE], NORMALS[INSIDE])
+    assert np.median(errors) < mean_angle(capture.light_directions, true) + 3
+    for lights_given, options, message in (
+        (None, {"pixel_size": 1.0}, "near lamps need positions"),
+        (true, {"first_light": "left"}, "first_light is for lights that are found"),
+        (None, {"first_light": "north"}, "first light comes from 'north'"),
+        (None, {"first_light": 400}, "first light comes from '400'"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            estimate_normals(images, lights_given, INSIDE, **options)
+
+
+def test_the_outline_turns_the_lights_no_further_than_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The far rim of a vessel's mouth is not turned outwards, and a turn that makes it so is wrong."""
+    true = lights()
+    found = {}
+    for angle in (0.2, 2.5):
+        monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: (true, np.full(10, 4.0), np.ones(10)))
+        turn = OutlineTurn(np.array((angle, 0.0, 0.0)), 0.1)
+        monkeypatch.setattr(unknown_lights, "turn_at_outline", lambda *_, turn=turn: turn)
+        found[angle] = mean_angle(find_lights(observed(true), INSIDE, True).directions, true)
+    assert found[2.5] < 4 and found[0.2] < 4

@@ -1,0 +1,140 @@
+"""Light intensities estimated from images, against scenes and captures with known intensities."""
+
+import re
+
+import numpy as np
+import pytest
+
+from scenes import shade, sphere_cap, write_capture
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.capture.reader import open_capture
+from splinecli.evaluation.protocol import draw_lights
+from splinecli.fits.robust import fit_scaled_normals
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.restoration.lamps import estimate_light_intensities
+
+INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
+
+
+def lights(count: int) -> np.ndarray:
+    azimuth = np.arange(count) * 2.4
+    radius = 0.3 + 0.5 * np.arange(count) / count
+    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
+
+
+def sphere(directions: np.ndarray, *, shine: float = 0.0) -> np.ndarray:
+    """Observations (P, F) of a sphere with attached shadows, random albedo, noise, and highlights if any."""
+    rng = np.random.default_rng(5)
+    axis = np.linspace(-0.95, 0.95, 50)
+    x, y = (values.ravel() for values in np.meshgrid(axis, axis))
+    inside = x**2 + y**2 < 0.9
+    x, y = x[inside], y[inside]
+    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    shading = np.maximum(normals @ directions.T, 0) * rng.uniform(0.2, 1, (len(normals), 1))
+    half = unit(directions + np.array((0.0, 0.0, 1.0)))
+    shading += shine * np.maximum(normals @ half.T, 0) ** 40
+    return shading * rng.normal(1, 0.01, shading.shape).clip(0.9, 1.1)
+
+
+@pytest.mark.parametrize(("n_lights", "shine"), [(6, 0.0), (8, 0.0), (8, 0.5)])
+def test_unequal_lights_are_estimated(n_lights, shine):
+    directions, intensities = lights(n_lights), INTENSITIES[:n_lights]
+    observations = (sphere(directions, shine=shine) * intensities).astype(np.float32)
+    found = estimate_light_intensities(observations, None, directions)
+    assert found.mean() == pytest.approx(1)
+    np.testing.assert_allclose(found, intensities / intensities.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
+def test_equal_lights_are_left_alone(shine):
+    directions = lights(8)
+    assert estimate_light_intensities(sphere(directions, shine=shine).astype(np.float32), None, directions) is None
+
+
+def test_scenes_that_do_not_determine_intensities():
+    eight = sphere(lights(8)) * INTENSITIES
+    never = eight * (np.arange(8) != 3)  # a lamp that did not flash
+    for observations in (sphere(lights(4)) * INTENSITIES[:4], eight[:40], np.zeros((500, 8)), never):
+        directions = lights(observations.shape[1])
+        assert estimate_light_intensities(observations.astype(np.float32), None, directions) is None
+
+
+@pytest.mark.parametrize("widths", [None, 3.0])
+@pytest.mark.parametrize("tilt", [0.0, 0.05])
+def test_flat_objects(widths, tilt):
+    """A relief whose slopes are around one tenth: with estimated intensities, normals are right but for the tilt."""
+    rng, size, directions = np.random.default_rng(1), 40, lights(8)
+    y, x = np.mgrid[1 : -1 : size * 1j, -1 : 1 : size * 1j]
+    slopes = (0.1 * np.cos(7 * x + 2 * y) + tilt, 0.1 * np.sin(6 * y))
+    normals = unit(np.stack((*slopes, np.ones_like(x)), axis=2).reshape(-1, 3))
+    vectors = np.broadcast_to(directions, (size**2, 8, 3))
+    if widths is not None:
+        lamps = NearLamps.of(directions * widths * size, 1.0, (size, size), equal=True)
+        towards, strengths = lamps.light_at(lamps.plane_points(*np.divmod(np.arange(size**2), size)))
+        vectors = towards * strengths[..., None]
+    shaded = np.einsum("pfc,pc->pf", vectors, normals) * rng.uniform(0.3, 1, (size**2, 1))
+    observations = (shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape)).astype(np.float32)
+    found = estimate_light_intensities(observations, None, lambda rows: vectors[rows])
+
+    def error_deg(intensities):
+        fit = fit_scaled_normals(observations / intensities, np.ones_like(observations), vectors)
+        return angle_between_deg(fit, normals).mean()
+
+    # The images leave the tilt open, which 0.05 makes 3 degrees.
+    assert error_deg(found) < 3 + 60 * tilt < 0.5 * error_deg(np.ones(8))
+    assert estimate_light_intensities(shaded.astype(np.float32), None, lambda rows: vectors[rows]) is None
+
+
+def test_saturated_observations_do_not_count():
+    directions = lights(8)
+    truth = sphere(directions) * INTENSITIES
+    stored = np.minimum(truth, 0.6).astype(np.float32)
+    found = estimate_light_intensities(stored, truth >= 0.6, directions)
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.05)
+
+
+def test_a_capture_without_a_file_of_intensities(tmp_path):
+    directions = lights(8)
+    shaded = np.moveaxis(shade(sphere_cap(40, 0.6), directions) * INTENSITIES, 2, 0)
+    write_capture(tmp_path, np.rint(30_000 * shaded).astype(np.uint16), directions)
+    source = open_capture(tmp_path)
+    plain, restored = source.read(as_stored=True), source.read()
+    assert plain.estimated_intensities is None
+    low, high = INTENSITIES.min() / INTENSITIES.mean(), INTENSITIES.max() / INTENSITIES.mean()
+    (warning,) = (warning for warning in restored.warnings if warning.code == "estimated_intensities")
+    stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
+    assert stated == pytest.approx([low, high], abs=0.02)
+    np.testing.assert_allclose(restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02)
+    np.testing.assert_allclose(restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5)
+    some = restored.choose_lights([6, 0, 2])
+    np.testing.assert_array_equal(some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]])
+    # Given intensities replace estimates.
+    np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
+    assert open_capture(tmp_path).read().estimated_intensities is None
+    (tmp_path / "light_intensities.txt").unlink()
+    assert open_capture(tmp_path, intensities="equal").read().estimated_intensities is None
+
+
+@pytest.mark.parametrize("name", ["ballPNG", "catPNG"])
+def test_real_objects_whose_lights_were_measured(shared_data, name):
+    """Ten of DiLiGenT's lights, of which the strongest is four to six times the weakest."""
+    source = open_capture(shared_data / "DiLiGenT/pmsData" / name)
+    capture = source.read()
+    measured = source.light_intensities.mean(axis=1)
+    for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
+        order, directions = list(chosen), capture.light_directions[list(chosen)]
+        observations = (capture.observations[:, order] * measured[order]).astype(np.float32)
+        found = estimate_light_intensities(observations, None, directions)
+        ratio = np.log(found / measured[order])
+        # Taken for equal, they would be off by 0.4 to 0.5.
+        assert np.std(ratio) < 0.06
+
+
+@pytest.mark.parametrize("place", ["uw/gray", "uw/horse", "synth/L17/sphere_M", "synth/L17/bowl_S"])
+@pytest.mark.parametrize("n_lights", [6, 10])
+def test_real_objects_under_equal_lights(shared_data, place, n_lights):
+    capture = open_capture(shared_data / place).read()
+    for chosen in draw_lights(capture.light_directions, n_lights, trials=3, seed=0):
+        order = list(chosen)
+        observations, directions = capture.observations[:, order], capture.light_directions[order]
+        assert estimate_light_intensities(observations, None, directions) is None
