@@ -78,7 +78,7 @@ PANELS = {
     },
     "prepare": {
         "Input": "as-stored update white-level",
-        "Scenes": "scenes mesh size n-lights seed",
+        "Scenes": "scenes mesh views relief size n-lights seed",
         "Output": "output json quiet",
         "Speed": "workers",
     },
