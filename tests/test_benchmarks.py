@@ -75,7 +75,7 @@ def test_photographs(run: Run) -> None:
 def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
-    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "16")
+    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
     assert int(printed.split()[0]) > 5
     rows = run("fit_capture_confidence", str(tmp_path)).splitlines()
     assert rows[0].startswith("| capture | number | claimed before")
