@@ -1,4 +1,7 @@
-"""The channels of the features that the refinement net reads; refinement/features.py computes them."""
+"""The refinement net, which corrects a map of normals and of their errors, and the features that it reads.
+
+refinement/features.py computes the features.
+"""
 
 import math
 from collections.abc import Sequence

@@ -221,10 +221,9 @@ class ScenePlan:
             index = _FIRST_MESH_INDEX + number
             mesh = read_mesh(mesh_file)
             if self.views:
-                others = tuple(read_mesh(path) for path in self.meshes if path != mesh_file)
+                others = tuple(path for path in self.meshes if path != mesh_file)
                 mesh = draw_view(mesh, others, np.random.default_rng([self.seed, index, 2]))
-        reliefs = tuple(read_relief(path) for path in self.reliefs)
-        scene = draw_scene(self.seed, index, self.config, mesh, reliefs)
+        scene = draw_scene(self.seed, index, self.config, mesh, self.reliefs)
         rendered = render_scene(scene, self.config, progress)
         if not rendered.mask.any():
             raise InputError(

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from splinecli.synthesis import fields
-from splinecli.synthesis.meshes import LONGEST_EDGE, Floats, Mesh, fit_to_frame, split_long_edges
+from splinecli.synthesis.meshes import LONGEST_EDGE, Floats, Mesh, fit_to_frame, read_mesh, split_long_edges
 
 SPACING = 0.0125
 """Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
@@ -56,16 +57,16 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
 _CLOSEST = 2.2  # largest factor by which a view is enlarged
 
 
-def draw_view(mesh: Mesh, others: Sequence[Mesh], rng: np.random.Generator) -> Mesh:
+def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> Mesh:
     """Draw a view of a mesh, which is in the frame.
 
-    The rotation is uniform. In half of the views another mesh, drawn from `others` and scaled by U(0.4, 1), touches it:
-    between bodies there are hollows with long shadows and indirect light. Half of the views are enlarged by
+    The rotation is uniform. In half of the views another mesh, of one of the files `others` and scaled by U(0.4, 1),
+    touches it: between bodies there are hollows with long shadows and indirect light. Half of the views are enlarged by
     U(1, 2.2) around a point of the surface, so that they show a part.
     """
     mesh = turn(mesh, draw_rotation(rng))
     if others and rng.random() < 0.5:
-        mesh = _touching(mesh, turn(others[int(rng.integers(len(others)))], draw_rotation(rng)), rng)
+        mesh = _touching(mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng)
     mesh = fit_to_frame(mesh)
     if rng.random() < 0.5:
         enlarged, middle = rng.uniform(1, _CLOSEST), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
