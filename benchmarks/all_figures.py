@@ -123,9 +123,8 @@ class Bench:
 
     def estimates(self, folder: Path, method: str, *, trials: int) -> Iterator[NormalEstimate]:
         """Yield the estimates of a capture under draws of ten lights."""
-        from splinecli.evaluation.protocol import draw_lights
-
         from splinecli.capture import open_capture
+        from splinecli.evaluation.protocol import draw_lights
         from splinecli.inference import estimate_normals
         from splinecli.methods import make_estimator
 
