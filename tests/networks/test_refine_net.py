@@ -31,7 +31,7 @@ def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]
 def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
     """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H, W)."""
     rows = [maps.flatten(1).T.contiguous() for maps in (observations, normals, error)]
-    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7, alternating_signs(lights), torch.zeros(2))
+    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7, alternating_signs(lights))
     return features.T.view(-1, *observations.shape[1:])
 
 

@@ -30,7 +30,7 @@ def photographed(truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: 
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
     normals = (truth if seen is None else seen).flatten(1).T
     signs = alternating_signs(lights)
-    features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, signs, torch.zeros(2))
+    features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, signs)
     return features.T.reshape(CHANNELS, SIDE, SIDE)
 
 

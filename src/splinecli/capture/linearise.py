@@ -186,10 +186,11 @@ def pixel_reader(
     like: str,
     window: Window,
     wanted: Integers | slice = EVERY_PIXEL,
+    around: Bools | None = None,
 ) -> Callable[[Path, int], tuple[Array, Singles]]:
     """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
 
-    Of linear light, it returns the `wanted` pixels alone.
+    Of linear light, it returns the `wanted` pixels alone, or all of them and then those of the mask `around` (H, W).
 
     The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
     image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
@@ -205,13 +206,15 @@ def pixel_reader(
     ) -> tuple[Array, Singles]:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
-        stored = take_pixels(window.of(image), mask)
-        linear = linear_light(stored[wanted], path, radiometry.curve)
+        image = window.of(image)
+        stored = take_pixels(image, mask)
+        used = stored[wanted] if around is None else np.concatenate((stored, take_pixels(image, around)))
+        linear = linear_light(used, path, radiometry.curve)
         return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
 
     def falloff(path: Path) -> Singles:
-        _, linear = pixels(path)
-        mean = linear.mean()
+        stored, linear = pixels(path)
+        mean = linear[: len(stored)].mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
@@ -234,7 +237,7 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    linear: Singles  # (P, C) float32, linear light; or (p, C) of the pixels that were wanted
+    linear: Singles  # (P, C) float32, linear light; or (p, C) of the pixels that were wanted; see pixel_reader
     intensity: Doubles  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states; None where it states none
 
@@ -261,16 +264,18 @@ class StoredPixels:
 
 
 def collect_observations(
-    images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None
+    images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None, n_around: int = 0
 ) -> tuple[Singles, Saturation, list[CaptureWarning], Doubles | None]:
-    """Return observations (P, F) of the images, in their order, which are saturated, warnings, and colours of lamps.
+    """Return observations (P + R, F) of the images in their order, which are saturated, warnings, and colours of lamps.
+
+    The last R observations are of pixels around the mask. Everything else concerns the mask alone.
 
     The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are not divided out.
 
     Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
     it is above an image's full scale.
     """
-    observations = np.empty((n_pixels, n_images), np.float32)
+    observations = np.empty((n_pixels + n_around, n_images), np.float32)
     any_8_bit, found, colours = False, list[ImageValues](), list[Singles]()
     compared = np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
     for position, image in enumerate(images):
@@ -282,11 +287,11 @@ def collect_observations(
         del image  # before the next one is decoded
     saturation = Saturation(n_pixels, tuple(found), white_level)
     warnings = white_level_warnings(saturation.white_level)
-    saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)
+    saturated = int(saturation.n_saturated.sum()) / max(n_pixels * n_images, 1)
     if saturated > codes.SATURATED_SHARE:
         text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."
         warnings.append(CaptureWarning(codes.SATURATED, text))
-    black = (n_pixels - np.count_nonzero(observations.any(axis=1))) / max(n_pixels, 1)
+    black = (n_pixels - np.count_nonzero(observations[:n_pixels].any(axis=1))) / max(n_pixels, 1)
     if black > BLACK_SHARE:
         text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
         text += " Leave them out with a mask or with --auto-mask."

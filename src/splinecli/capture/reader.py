@@ -39,6 +39,7 @@ from splinecli.capture_warnings import ESTIMATED_COLOURS, CaptureWarning
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Doubles
 from splinecli.restoration.images import check_white_level
+from splinecli.restoration.lens_blur import remove_blur, surroundings
 from splinecli.system.files import StrPath
 
 EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
@@ -254,8 +255,8 @@ def capture_from_arrays(
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
             integer images; floating-point images then have none.
-        as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
-            are estimated.
+        as_stored: use the values alone. By default, the blur of the lens is removed, saturated observations are
+            restored, and unknown light intensities are estimated.
         find_lights: finds the lights from the images, where none are given.
 
     Raises:
@@ -276,24 +277,28 @@ def capture_from_arrays(
     if inside.shape != shape:
         raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
 
+    around = None if as_stored else surroundings(inside)
+    sizes = int(inside.sum()), n_lights, white_level, 0 if around is None else int(around.sum())
+
     def pixels() -> Iterator[StoredPixels]:
         for index, image in enumerate(stack):
-            values = (image if image.ndim == 3 else image[..., None])[inside]
-            path = Path(f"images[{index}]")
-            yield StoredPixels(path, values, linear_light(values, path), intensities[index])
+            pixels = image if image.ndim == 3 else image[..., None]
+            values, path = pixels[inside], Path(f"images[{index}]")
+            used = values if around is None else np.concatenate((values, pixels[around]))
+            yield StoredPixels(path, values, linear_light(used, path), intensities[index])
 
-    observations, saturation, warnings, colours = collect_observations(
-        pixels(), int(inside.sum()), n_lights, white_level
-    )
+    observations, saturation, warnings, colours = collect_observations(pixels(), *sizes)
     if as_stored:
         warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
     if colours is not None:
         intensities = intensities * colours
-        observations = collect_observations(pixels(), int(inside.sum()), n_lights, white_level)[0]
+        observations = collect_observations(pixels(), *sizes)[0]
+    blur = None if around is None else remove_blur(observations, inside, around)
+    observations = observations[: sizes[0]]
     indices, level = tuple(range(n_lights)), saturation.white_level
     capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
     matrix = None if camera_matrix is None else np.asarray(camera_matrix, np.float64)
-    capture = replace(capture, estimated_colours=colours, camera_matrix=matrix)
+    capture = replace(capture, estimated_colours=colours, camera_matrix=matrix, removed_blur=blur)
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)

@@ -113,6 +113,7 @@ class Capture:
             and for captures that are not read from images.
         light_errors_deg: (F,) float64, the expected errors of light_directions where they were found from the images;
             else None.
+        removed_blur: the standard deviation in pixels of the blur that was removed from the images; None for none.
         lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
             image on the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic camera. Near lamps
@@ -136,6 +137,7 @@ class Capture:
     estimated_colours: Doubles | None = None
     restored: Bools | None = None
     white_level: WhiteLevel | None = None
+    removed_blur: float | None = None
     lamps: NearLamps | None = None
     light_errors_deg: Doubles | None = None
     camera_matrix: Doubles | None = None
@@ -288,7 +290,7 @@ class StoredCapture:
     level of a choice is decided from its images alone.
     """
 
-    capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
+    capture: Capture  # linear observations, divided by the light intensities that the files give
     saturation: Saturation
     intensities_known: bool  # whether a file, an option or the image format gives the light intensities
     found_intensities: Doubles | None = None  # (F,), those that were found together with the directions, or None

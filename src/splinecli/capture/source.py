@@ -40,6 +40,7 @@ from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DO
 from splinecli.errors import InputError
 from splinecli.maths import Bools, Doubles, Integers
 from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
+from splinecli.restoration.lens_blur import remove_blur, surroundings
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -87,16 +88,16 @@ class CaptureSource:
         the mask are ignored.
 
         Args:
-            as_stored: use the stored values alone. By default, saturated observations are restored (see
-                restore_saturated) and light intensities that no file gives are estimated (see
-                estimate_light_intensities).
+            as_stored: use the stored values alone. By default, the blur of the lens is removed (see remove_blur),
+                saturated observations are restored (see restore_saturated), and light intensities that no file gives
+                are estimated (see estimate_light_intensities).
 
         Raises:
             UsageError: an index is out of range, comes twice, or there are fewer than three.
             InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
                 the lights cannot give normals (see Capture).
         """
-        stored = self.read_stored(light_indices, progress, divide_colours=not as_stored)
+        stored = self.read_stored(light_indices, progress, as_stored=as_stored)
         return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
     def read_stored(
@@ -104,11 +105,13 @@ class CaptureSource:
         light_indices: Sequence[int] | None = None,
         progress: Progress = lambda: None,
         *,
+        as_stored: bool = False,
         divide_colours: bool = True,
     ) -> StoredCapture:
-        """Return the stored values under the chosen lights and the data needed to restore them; see read.
+        """Return the values under the chosen lights and the data needed to restore the saturated ones; see read.
 
-        With `divide_colours`, colours of lamps that differ are divided out, unless the user says that lamps are equal.
+        Unless they are wanted as stored, the blur of the lens is removed (see remove_blur), and colours of lamps that
+        differ are divided out, unless the user says that lamps are equal.
         """
         everything = tuple(range(self.n_lights))
         indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
@@ -117,12 +120,15 @@ class CaptureSource:
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
-        images = self.read_pixels(mask, indices, lambda pixels: pixels, progress)
-        n_pixels = int(np.count_nonzero(mask))
-        collected = collect_observations(images, n_pixels, len(indices), self.white_level)
+        n_pixels, around, n_around = int(np.count_nonzero(mask)), None, 0
+        if not as_stored and self.window.step == 1:
+            around = surroundings(mask)
+            n_around = int(np.count_nonzero(around))
+        images = self.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
+        collected = collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
         observations, saturation, warnings, colours = collected
         equal = self.intensities_known and not self.intensities_measured
-        if equal or not divide_colours:
+        if equal or as_stored or not divide_colours:
             warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
         if colours is not None:  # only the mean of the channels was kept, so the images are read again
             del images, collected, observations
@@ -132,6 +138,8 @@ class CaptureSource:
             again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
             stored = again.read_stored(indices, progress, divide_colours=False)
             return replace(stored, capture=replace(stored.capture, estimated_colours=colours))
+        blur = None if around is None else remove_blur(observations, mask, around)
+        observations = observations[:n_pixels]
         warnings = [*self.warnings, *warnings]
         if upside_down:
             text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
@@ -147,6 +155,7 @@ class CaptureSource:
             ground_truth=ground_truth,
             warnings=tuple(warnings),
             white_level=saturation.white_level,
+            removed_blur=blur,
             lamps=None if lamps is None else lamps.choose_lights(indices),
             camera_matrix=None
             if lamps is not None or self.camera_matrix is None
@@ -233,14 +242,15 @@ class CaptureSource:
         use: Callable[[StoredPixels], Item],
         progress: Progress = lambda: None,
         wanted: Integers | slice = EVERY_PIXEL,
+        around: Bools | None = None,
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
-        Of these pixels (P,), the stored values are complete, and the linear ones are those that are `wanted`. Raises
-        InputError where an image cannot be read, or does not have the size of the mask.
+        Of these pixels (P,), the stored values are complete; for the linear ones, see pixel_reader. Raises InputError
+        where an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
-        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted)
+        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
 
         def read(index: int) -> Item:
             facts, intensity = self.facts[index], self.light_intensities[index]

@@ -202,7 +202,7 @@ def capture_figures(
     trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
     steps = 1 + len(estimators)
-    stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps))
+    stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps), as_stored=protocol.as_stored)
     capture = TrialSource(stored).see(trial)
     assert capture.ground_truth is not None  # or there is no first trial
     normals: dict[str, NDArray[np.float32]] = {}

@@ -267,14 +267,15 @@ class CaptureReading:
 
     def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
         """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
-        numbers = count(1)
+        numbers, as_stored = count(1), all(protocol.as_stored for protocol in self.protocols)
         try:
-            stored = source.read_stored(self.lights, lambda: on_image(next(numbers), len(self.lights)))
+            stored = source.read_stored(
+                self.lights, lambda: on_image(next(numbers), len(self.lights)), as_stored=as_stored
+            )
         except OSError as error:
             raise as_splinecli_error(error, self.folder) from error
         first = self.protocols[0]
         rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
-        as_stored = all(protocol.as_stored for protocol in self.protocols)
         if len(rows) == stored.capture.n_pixels:
             trials = TrialSource(stored)
         elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):

@@ -76,7 +76,6 @@ class NetworkConfig:
     error_head: bool = False  # whether NE-Net also estimates its own error. Compact size only.
     refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
     refines_twice: bool = False  # whether a second refinement net follows the first
-    reads_sharpness: bool = False  # whether the refinement nets read how sharp the images are
     set_width: int = 0  # channels of the set branch, 0 for none. Compact size only.
     set_layers: int = 3  # attention layers of the set branch
     sees_capture: bool = False  # whether pixels see a sample of their capture. Needs a set branch.
@@ -126,8 +125,6 @@ class NetworkConfig:
             raise ModelError("network setting 'refines' needs 'error_head'")
         if config.refines_twice and not config.refines:
             raise ModelError("network setting 'refines_twice' needs 'refines'")
-        if config.reads_sharpness and not config.refines:
-            raise ModelError("network setting 'reads_sharpness' needs 'refines'")
         if config.sees_capture and not config.set_width:
             raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
         if config.set_width % HEAD_WIDTH:

@@ -31,7 +31,6 @@ FEATURE_WIDTHS = {
     "n_lights": 1,  # logarithm
     "halves": 3,  # how two halves of the lights differ; the sign means nothing. See TwoHalves
     "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of refinement/detail.py
-    "sharpness": 2,  # of the images of the capture, the same for all pixels; see refinement/sharpness.py
 }
 """The features and their numbers of channels. Vectors have x and y first."""
 
@@ -103,17 +102,14 @@ class RefineNet(nn.Module):
     Args:
         twice: whether a second such net, `again`, corrects the result. It reads what the first one reads, with the
             first one's normals and errors.
-        reads_sharpness: whether the nets also read how sharp the images are. How far detail must be raised depends on
-            the lens, and the estimated normals hardly tell a soft lens from a smooth surface.
 
     Attributes:
         reach: no pixel further away than this changes a result.
     """
 
-    def __init__(self, *, twice: bool = False, reads_sharpness: bool = False) -> None:
+    def __init__(self, *, twice: bool = False) -> None:
         super().__init__()
         self.enter = nn.Conv2d(READ + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
-        self.sharpness = zeroed(nn.Conv2d(2, WIDTHS[0], 1, bias=False)) if reads_sharpness else None
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
@@ -125,7 +121,7 @@ class RefineNet(nn.Module):
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
-        self.again = RefineNet(reads_sharpness=reads_sharpness) if twice else None
+        self.again = RefineNet() if twice else None
         self.reach = _REACH * (1 + twice)
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
@@ -157,10 +153,7 @@ class RefineNet(nn.Module):
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
         # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
         read = features[:, :READ], *towards, mask
-        x = self.enter(_joined(read, border, layers))
-        if self.sharpness is not None:
-            x = x + self.sharpness(_joined((features[:, channels("sharpness")],), border, layers))
-        x = x.mul_(masks[0]).to(stream)
+        x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
         mask, normals, error, *towards = (maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards))
         passed = []
         for scale, blocks in enumerate(self.encode):

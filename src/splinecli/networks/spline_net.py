@@ -84,7 +84,7 @@ class SplineNet(nn.Module):
             self.set_branch = SetBranch(config.set_width, config.set_layers, fits, sees_capture=config.sees_capture)
         self.refine_net: RefineNet | None = None
         if config.refines:
-            self.refine_net = RefineNet(twice=config.refines_twice, reads_sharpness=config.reads_sharpness)
+            self.refine_net = RefineNet(twice=config.refines_twice)
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)

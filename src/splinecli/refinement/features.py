@@ -31,7 +31,6 @@ def refine_features(
     error: Tensor,
     reference: float,
     signs: Tensor,
-    sharpness: Tensor,
 ) -> Tensor:
     """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to 1.
 
@@ -42,7 +41,6 @@ def refine_features(
         error: (P, 2), see networks/li_ne_net.py.
         reference: the brightness of the capture, see `brightness`.
         signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
-        sharpness: (2,), of the capture, see refinement/sharpness.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -75,7 +73,6 @@ def refine_features(
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (_HALVES_SCALE * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
-        "sharpness": sharpness.expand(len(observed), -1),
     }
     return torch.cat([features[name] for name in FEATURE_WIDTHS], dim=1)
 

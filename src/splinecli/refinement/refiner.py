@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_o
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.halving import HalfCapture
-from splinecli.refinement.sharpness import image_sharpness
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
@@ -60,10 +58,6 @@ class _Capture:
     errors: Floats
     reference: float  # reference, signs: of the whole capture; see refine_features
     signs: torch.Tensor
-
-    @cached_property
-    def sharpness(self) -> torch.Tensor:
-        return image_sharpness(self.mask, self.observations)
 
 
 @dataclass(eq=False)
@@ -164,7 +158,6 @@ class NetworkRefiner:
                 self._tensor(capture.errors[rows]),
                 capture.reference,
                 capture.signs,
-                capture.sharpness.to(self._device),
             )
 
         features = self._maps(tile, CHANNELS, capture.light_of, features_of)

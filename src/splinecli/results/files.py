@@ -188,6 +188,7 @@ def report_of(
         "version": __version__,
         "reading": name_reading(as_stored=options["as_stored"]),
         "white_level": None if capture.white_level is None else asdict(capture.white_level),
+        "removed_blur": None if capture.removed_blur is None else round(capture.removed_blur, 2),
         "surface": None,
     }
 

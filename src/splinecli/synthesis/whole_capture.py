@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from splinecli.restoration.images import restore_saturated
+from splinecli.restoration.lens_blur import remove_blur, surroundings
 from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth, photograph
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.faults import (
@@ -90,7 +91,8 @@ def photograph_images(
     """Photograph images (F, H, W) of radiance with their background; return what photograph_scene does of a mask.
 
     `config.optics_share` of the captures come from a camera of draw_optics, which mixes neighbouring pixels. Its
-    saturation and noise are those of the sensor, before a Bayer pattern is interpolated.
+    saturation and noise are those of the sensor, before a Bayer pattern is interpolated. As in `infer`, the blur is
+    estimated and removed.
     """
     return _photograph(images.flatten(1).T, directions, config, generator, mask)
 
@@ -105,8 +107,11 @@ def _photograph(
     arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
     share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
-    wanted = slice(None) if mask is None else mask.flatten()
-    metered = arriving[wanted].flatten()
+    around = None if mask is None else torch.from_numpy(surroundings(mask.numpy()))
+    wanted: slice | Tensor = slice(None)
+    if mask is not None and around is not None:
+        wanted = torch.cat([part.flatten().nonzero()[:, 0] for part in (mask, around)])
+    metered = (arriving if mask is None else arriving[mask.flatten()]).flatten()
     bright = metered.sort().values[-1 - math.floor(share * metered.numel())].clamp(min=1e-6)
     exposure = float((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)
     exposed = arriving * exposure
@@ -135,6 +140,11 @@ def _photograph(
     if uniform() < _UNMEASURED_SHARE * config.light_intensity_error_share:
         errors = errors * 2 ** (uniform(0, _MOST_UNMEASURED) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
+    if mask is not None and around is not None:
+        values = observed.contiguous().numpy()
+        remove_blur(values, mask.numpy(), around.numpy())
+        pixels = slice(0, int(mask.sum()))
+        observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
     calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
     if saturated:
         values = observed.contiguous().numpy()

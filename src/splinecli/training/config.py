@@ -191,7 +191,7 @@ PRESETS = {
         network=_COMPACT, pixels=PixelGeneratorConfig(capture_pixels=64), batch_size=512, shards=2
     ),
     "refine": TrainingConfig(
-        network=replace(_COMPACT, error_head=True, refines=True, refines_twice=True, reads_sharpness=True),
+        network=replace(_COMPACT, error_head=True, refines=True, refines_twice=True),
         start_from="spline-net",
         updates="refine_net",
         batch_size=4,

@@ -42,12 +42,12 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 def _start_from(weights: str, network: SplineNet) -> None:
     """Copy the weights into the network. It may have parts that they lack.
 
-    These are an error head, refinement nets and layers that see the capture or read how sharp it is.
+    These are an error head, refinement nets and layers that see the capture.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:
-        added = name in ("sees_capture", "refines_twice", "reads_sharpness") and wanted[name]
+        added = name in ("sees_capture", "refines_twice") and wanted[name]
         if wanted[name] != found[name] and name not in ("error_head", "refines") and not added:
             problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
             raise ModelError(

@@ -22,7 +22,7 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
-from splinecli.refinement.sharpness import image_sharpness
+from splinecli.restoration.lens_blur import REACH
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
@@ -51,8 +51,8 @@ _MOST_ENLARGED = 3.0
 _BACKGROUND_SHARE = 0.35
 """A share of the captures shows what lies behind the object; see add_background."""
 
-_DARK_MARGIN = 4
-"""Pixels of darkness around the others, which a lens mixes with the outline."""
+_DARK_MARGIN = REACH
+"""Pixels of darkness around the others, which a lens and its inverse filter mix with the outline."""
 
 _SCATTERING_SHARE = 0.2
 """A share of the captures of diffuse scenes scatters light below the surface; see scatter."""
@@ -81,6 +81,20 @@ class SceneMaps(NamedTuple):
     def to(self, device: torch.device) -> SceneMaps:
         """Return the maps on a device."""
         return SceneMaps(*(maps.to(device) for maps in self))
+
+
+class Scene(NamedTuple):
+    """What is photographed.
+
+    Attributes:
+        maps: (F + 3, H, W), radiance under each light and true unit normals.
+        lights: (F, 3), unit directions.
+        mask: (H, W) bool.
+    """
+
+    maps: Tensor
+    lights: Tensor
+    mask: Tensor
 
 
 class ScenePool:
@@ -113,18 +127,19 @@ class ScenePool:
     def add(self) -> None:
         """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
         generator = torch.Generator().manual_seed(stream_seed(self.seed, self._made))
-        self.examples.append(self._draw_example(generator))
+        self.examples.append(self._after_network(*self.draw_scene(generator), generator))
         self._made += 1
 
-    def _draw_example(self, generator: torch.Generator) -> SceneMaps:
-        if float(torch.rand((), generator=generator)) < _ENGRAVED_SHARE:
-            return self._photograph_engraved(generator)
+    def draw_scene(self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE) -> Scene:
+        """Draw a part of a scene, or an engraved piece, and the lights under which it is photographed."""
+        if float(torch.rand((), generator=generator)) < engraved_share:
+            return self._draw_engraved(generator)
         weights = torch.tensor([weight for _, _, weight in self.scenes])
         pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
         entry = entries[int(torch.randint(len(entries), (), generator=generator))]
-        return self._photograph(pixel_set, entry, generator)
+        return self._draw_part(pixel_set, entry, generator)
 
-    def _photograph(self, pixel_set: PixelSet, entry: Entry, generator: torch.Generator) -> SceneMaps:
+    def _draw_part(self, pixel_set: PixelSet, entry: Entry, generator: torch.Generator) -> Scene:
         pixels = pixel_set.load(entry)
         lights = torch.from_numpy(np.array(pixels.light_directions))
         most = min(self.config.max_lights, entry.n_lights)
@@ -142,14 +157,14 @@ class ScenePool:
         scatters = torch.rand((), generator=generator) < _SCATTERING_SHARE * self.config.optics_share
         if scatters and "-diffuse" in entry.name:
             maps[:-3] = scatter(maps[:-3], mask, generator)
-        return self._after_network(maps, lights[chosen], mask, generator)
+        return Scene(maps, lights[chosen], mask)
 
-    def _photograph_engraved(self, generator: torch.Generator) -> SceneMaps:
+    def _draw_engraved(self, generator: torch.Generator) -> Scene:
         config = self.config
         count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
         lights = draw_light_directions(1, int(count), generator)[0]
         truth, radiance, mask = draw_engraved(_ENGRAVED_SIZE, lights, generator)
-        return self._after_network(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask, generator)
+        return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
 
     def _after_network(self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator) -> SceneMaps:
         """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
@@ -220,12 +235,11 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     assert errors is not None, "TrainingConfig asks for an error head"
     lights = light_directions.to(estimator.device)
     signs, reference = alternating_signs(lights), brightness(observations)
-    sharpness = image_sharpness(mask.numpy(), observations.numpy()).to(lights.device)
 
     def features_of(rows: Rows) -> Tensor:
         values = light_of(rows).observations, estimated[rows], errors[rows]
         seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
-        return refine_features(seen, lights, normals, error, reference, signs, sharpness)
+        return refine_features(seen, lights, normals, error, reference, signs)
 
     return torch.cat([features_of(rows) for rows in parts_of_rows(len(observations))])
 

@@ -1,0 +1,221 @@
+"""What lens and Bayer pattern took from the images of a capture: how wide their blur is, and observations without it.
+
+A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because it fills shadows,
+flattens highlights and mixes the outline with the background. Its width is estimated from the images alone: edges of
+shadows and highlights, and the outline of the object, are steps on any surface.
+A filter by Wiener's criterion then inverts it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.maths import Bools, Doubles, Singles
+
+REACH = 6
+"""Pixels around the object that the filter mixes with it, and half of the filter's side minus one."""
+
+SMALLEST_SIGMA = 0.4
+"""A narrower blur is left alone: it costs little, and its estimate is wrong by 0.1 to 0.2 pixels."""
+
+WIDEST_SIGMA = 1.2  # the widest one of the captures to which the estimate was fitted
+
+NOISE = 0.005
+"""Mean power of the noise over that of the images. Chosen on rendered captures with noise, 8 bits and JPEG."""
+
+_MOST_IMAGES = 12
+_OUTLINE = 4  # pixels around the object whose steps are looked at
+_SQUARES, _SIDE = 16, 128  # of a capture that has more pixels, only so many squares are looked at
+_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that count as edges
+_FEWEST_EDGES = 60
+_CORRELATION_ERROR = 0.1
+_THREADS = 2
+
+# benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and the coefficients of
+# a quadratic polynomial of the five.
+_MEANS = (0.5511, 0.6893, 0.5505, 0.1675, 0.01223)
+_DEVIATIONS = (0.1537, 0.1952, 0.2823, 0.2043, 0.1355)
+_COEFFICIENTS = (
+    0.5471,
+    0.08626,
+    -0.2653,
+    0.08725,
+    0.1342,
+    -0.1189,
+    -0.04015,
+    0.01734,
+    -0.02201,
+    0.01165,
+    0.01648,
+    -0.04393,
+    -0.09538,
+    0.01304,
+    -0.0863,
+    -0.02431,
+    -0.01935,
+    -0.04998,
+    0.09267,
+    -0.06995,
+    0.0123,
+)
+
+
+def surroundings(mask: Bools) -> Bools:
+    """Return the pixels (H, W) around a mask that remove_blur needs; none of them is in the mask."""
+    wide = cv2.dilate(mask.astype(np.uint8), np.ones((2 * REACH + 1,) * 2, np.uint8)) > 0
+    return np.asarray(wide & ~mask)
+
+
+def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | None:
+    """Sharpen observations in place; return the estimated blur, or None if there is none that matters.
+
+    Args:
+        observations: (P + R, F), of the P pixels of a mask (H, W), then of the R pixels around it, which keep their
+            values.
+        around: (H, W), see surroundings.
+
+    Returns:
+        The standard deviation of the blur along either axis, in pixels.
+    """
+    rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
+    numbers = edge_numbers(observations, mask, around)
+    if numbers is None:
+        return None
+    terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
+    sigma = min(float(terms @ np.array(_COEFFICIENTS)), _widest_at(numbers[2]), WIDEST_SIGMA)
+    if sigma < SMALLEST_SIGMA:
+        return None
+    box = _box(mask, REACH)
+    rows, inside, kernel = rows[box], mask[box], inverse_filter(sigma)
+
+    def sharpen(light: int) -> None:
+        image = np.where(rows < 0, np.float32(0), observations[rows, light])
+        observations[:n_pixels, light] = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)[inside]
+
+    with ThreadPoolExecutor(_THREADS, "sharpen") as pool:
+        list(pool.map(sharpen, range(observations.shape[1])))
+    np.maximum(observations[:n_pixels], 0, out=observations[:n_pixels])
+    return sigma
+
+
+def polynomial(numbers: Doubles, means: Doubles, deviations: Doubles) -> Doubles:
+    """Return 1, the standardised numbers (..., N) and their products, (..., (N + 1)(N + 2) / 2)."""
+    standard = ((numbers - means) / deviations).clip(-3, 3)
+    with_one = np.concatenate((np.ones_like(standard[..., :1]), standard), axis=-1)
+    first, second = np.triu_indices(with_one.shape[-1])
+    return np.asarray(with_one[..., first] * with_one[..., second])
+
+
+def _widest_at(correlation: float) -> float:
+    """Return the widest blur at which gradients of neighbouring pixels have no more than this correlation.
+
+    Of all surfaces, one whose pixels have nothing in common has the least correlation behind a blur. Such fine texture
+    is none of the captures to which the polynomial was fitted.
+    """
+    sigmas = np.linspace(0.05, 2, 200)
+    one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)  # of the values, at one and two pixels
+    of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
+    return float(np.interp(correlation + _CORRELATION_ERROR, of_gradients, sigmas))
+
+
+def inverse_filter(sigma: float) -> Singles:
+    """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
+
+    Of all filters of this size it has the least mean square error (Wiener's criterion) for images whose power falls
+    with the square of the frequency, as that of edges does, and white noise.
+    """
+    frequencies = np.arange(33) / 64
+    places = np.arange(REACH + 1)
+    waves = np.cos(2 * np.pi * frequencies[:, None] * places) * np.where(places > 0, 2, 1)
+    terms = np.kron(waves, waves)  # the transfer function of each weight in a quadrant of the filter
+    squared = (frequencies[:, None] ** 2 + frequencies**2).ravel()
+    passed = np.exp(-2 * (np.pi * sigma) ** 2 * squared)
+    power = 1 / squared.clip(min=frequencies[1] ** 2)
+    power /= power.mean()
+    weights = np.linalg.solve((terms.T * (power * passed**2 + NOISE)) @ terms, terms.T @ (power * passed))
+    mirrored = np.abs(np.arange(-REACH, REACH + 1))
+    kernel = weights.reshape(REACH + 1, -1)[mirrored[:, None], mirrored]
+    return np.asarray(kernel / kernel.sum(), np.float32)
+
+
+def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles | None:
+    """Return five numbers (5,) that tell how sharp the images of a capture are, or None if they have too few edges.
+
+    Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
+    lower and the upper quartile over the steepest ones. A step between two pixels has 1; behind a blur of 0.7 pixels,
+    it has 0.58. Then the correlation of the gradients of neighbouring pixels between different images, which noise does
+    not change, and of gradients at a distance of two and three pixels in the same image.
+
+    See remove_blur for the arguments. The object and a narrow strip around it are looked at, in few images and, of a
+    large capture, in few squares. Values above the 0.95 quantile are cut, so that highlights do not decide alone.
+    """
+    rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
+    chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
+    level = max(float(np.quantile(chosen[:n_pixels:7], 0.95)), 1e-12)
+    region = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _OUTLINE + 1,) * 2, np.uint8)) > 0
+    boxes = _looked_at(mask, region)
+    parts, inside = np.stack([rows[box] for box in boxes]), np.stack([region[box] for box in boxes])
+    images = np.moveaxis(
+        (chosen[parts] / np.float32(level)).clip(max=1) * (parts >= 0)[..., None], 3, 1
+    )  # (T, F, h, w)
+    edges, shares, across, pairs, square, two, three = [], [], 0.0, 0.0, 0.0, 0.0, 0.0
+    for axis in (2, 3):
+        lines, whole = np.moveaxis(images, axis, 3), np.moveaxis(inside, axis - 1, 2)
+        both = whole[..., 1:] & whole[..., :-1]
+        steps = np.diff(lines, axis=3) * both[:, None]
+        before, middle, after = steps[..., :-2], steps[..., 1:-1], steps[..., 2:]
+        size, rising = np.abs(middle), np.sign(middle)
+        three_steps = (both[..., :-2] & both[..., 1:-1] & both[..., 2:])[:, None]
+        peaks = three_steps & (size >= np.abs(before)) & (size >= np.abs(after)) & (size > 0)
+        sums = size + np.maximum(rising * before, 0) + np.maximum(rising * after, 0)
+        edges.append(sums[peaks])
+        shares.append(size[peaks] / sums[peaks])
+        total = steps.sum(axis=1)
+        across += _product(total[..., 1:], total[..., :-1]) - _product(steps[..., 1:], steps[..., :-1])
+        pairs += _product(total, total)
+        square += _product(steps, steps)
+        two += _product(steps[..., 2:], steps[..., :-2])
+        three += _product(steps[..., 3:], steps[..., :-3])
+    edge, share = np.concatenate(edges), np.concatenate(shares)
+    if len(edge) < _FEWEST_EDGES:
+        return None
+    steepest = share[edge >= np.quantile(edge, 1 - _STEEP_SHARE)]
+    between = across / (pairs - square) if pairs > square else 0.5
+    return np.array([*np.quantile(steepest, (0.25, 0.75)), between, two / square, three / square])
+
+
+def _product(one: Singles, other: Singles) -> float:
+    return float((one * other).sum(dtype=np.float64))
+
+
+def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
+    """Return the rows (H, W) of the observations of remove_blur, -1 where a pixel has none."""
+    rows = np.full(mask.shape, -1, np.int32)
+    n_pixels = np.count_nonzero(mask)
+    rows[mask] = np.arange(n_pixels, dtype=np.int32)
+    rows[around] = n_pixels + np.arange(np.count_nonzero(around), dtype=np.int32)
+    return rows
+
+
+def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
+    """Return the parts (y, x) of a capture that show its blur: all of it, or squares of one size."""
+    box = _box(region, 0)
+    if region[box].size <= _SQUARES * _SIDE**2:
+        return [box]
+    places = np.flatnonzero(mask)[np.linspace(0, np.count_nonzero(mask) - 1, _SQUARES + 2).astype(int)[1:-1]]
+    corners = np.stack(np.divmod(places, mask.shape[1]), axis=1) - _SIDE // 2
+    corners = corners.clip(0, np.maximum(np.array(mask.shape) - _SIDE, 0))
+    return [(slice(y, y + _SIDE), slice(x, x + _SIDE)) for y, x in corners.tolist()]
+
+
+def _box(mask: Bools, margin: int) -> tuple[slice, slice]:
+    """Return the part (y, x) of an image that holds a mask (H, W) and as many pixels around it."""
+    y, x = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(int(y[0]) - margin, 0), int(y[-1]) + margin + 1),
+        slice(max(int(x[0]) - margin, 0), int(x[-1]) + margin + 1),
+    )
