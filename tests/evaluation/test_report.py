@@ -44,7 +44,8 @@ def test_one_evaluation() -> None:
     protocol = dict(zip(page.text["dt"], page.text["dd"], strict=True))
     assert protocol == {
         "Methods": "ls, iw12", "Captures": "ball, cat", "Lights": "10 lights", "Trials": "4", "Seed": "7",
-        "Image values": "saturated observations restored, unknown light intensities estimated, as infer does",
+        "Image values":
+            "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does",
         "Draws of lights": "at random from the seed, the same for all methods", "Light noise": "none",
         "Pixels scored": "at most 500 of each capture, at random", "splinecli": __version__,
     }  # fmt: skip

@@ -87,7 +87,7 @@ def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> Non
     assert {record["as_stored"] for record in document["results"]} == {as_stored}
     rows = csv.DictReader(results_csv([evaluation]).splitlines())
     assert {row["as_stored"] for row in rows} == {str(as_stored)}
-    shown = "as stored: nothing restored" if as_stored else "saturated observations restored"
+    shown = "as stored: nothing restored" if as_stored else "lens blur removed, saturated observations restored"
     assert shown in html_report([evaluation], [], [])
 
 

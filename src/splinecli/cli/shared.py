@@ -250,7 +250,9 @@ WHITE_LEVEL = Option(
     None, metavar="N", min=0, help="Stored value from which a pixel counts as saturated. [default: found in the images]"
 )
 AS_STORED = Option(
-    False, "--as-stored", help="Use the stored values: do not restore saturated pixels or estimate light intensities."
+    False,
+    "--as-stored",
+    help="Use the stored values: do not remove lens blur, restore saturated pixels or estimate light intensities.",
 )
 SEED = Option(0, metavar="S", min=0, max=2**32 - 1, help="Seed of the random draws.")
 

@@ -45,7 +45,7 @@ from splinecli.system.publishing import new_files
 
 _MOST_SENTENCES = 3  # pairs, those of three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
-_RESTORED = "saturated observations restored, unknown light intensities estimated, as infer does"
+_RESTORED = "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does"
 _AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
 
 Mark = Literal["", "star", "best"]

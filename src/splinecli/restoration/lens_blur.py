@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,8 +65,13 @@ _COEFFICIENTS = (
 
 def surroundings(mask: Bools) -> Bools:
     """Return the pixels (H, W) around a mask that remove_blur needs; none of them is in the mask."""
-    wide = cv2.dilate(mask.astype(np.uint8), np.ones((2 * REACH + 1,) * 2, np.uint8)) > 0
-    return np.asarray(wide & ~mask)
+    return _grown(mask, REACH) & ~mask
+
+
+def _grown(mask: Bools, reach: int) -> Bools:
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
 
 
 def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | None:
@@ -81,6 +85,8 @@ def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | No
     Returns:
         The standard deviation of the blur along either axis, in pixels.
     """
+    import cv2
+
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
     numbers = edge_numbers(observations, mask, around)
     if numbers is None:
@@ -156,7 +162,7 @@ def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles |
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
     chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
     level = max(float(np.quantile(chosen[:n_pixels:7], 0.95)), 1e-12)
-    region = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _OUTLINE + 1,) * 2, np.uint8)) > 0
+    region = _grown(mask, _OUTLINE)
     boxes = _looked_at(mask, region)
     parts, inside = np.stack([rows[box] for box in boxes]), np.stack([region[box] for box in boxes])
     images = np.moveaxis(
