@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import InputError
+from splinecli.pipeline import incoming
 from splinecli.pipeline.incoming import Arrivals
 
 
@@ -35,10 +36,29 @@ def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path
     clock.seconds = 9
     assert arrivals.take() == [tmp_path / "part9"]
     assert arrivals.take() == []
-    put(tmp_path / "part10/1.png", "a longer image")
+    put(tmp_path / "part10/2.png")
     assert arrivals.take() == []
     clock.seconds = 20
     assert arrivals.take() == [tmp_path / "part10"]
+
+
+def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of a thousand captures would be read again each second."""
+    clock, walked = Clock(), list[Path]()
+    arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out", clock=clock)
+    walk = incoming._stamp
+    monkeypatch.setattr(incoming, "_stamp", lambda capture: walked.append(capture) or walk(capture))
+    done, other = tmp_path / "done", tmp_path / "other"
+    put(done / "images/1.png")
+    put(other / "1.png")
+    assert arrivals.take() == [done, other]
+    put(done / "images/1.png", "an image that is written in place")
+    clock.seconds = 1
+    assert (arrivals.take(), walked) == ([], [done, other])
+    put(other / "2.png")
+    assert (arrivals.take(), walked[2:]) == ([other], [other])
+    clock.seconds = 1 + incoming.SECONDS_BETWEEN_FILES
+    assert arrivals.take() == [done]
 
 
 def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(tmp_path: Path) -> None:

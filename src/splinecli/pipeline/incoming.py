@@ -90,12 +90,19 @@ def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
 
 
+SECONDS_BETWEEN_FILES = 60.0
+"""How often the files of a capture that was returned are looked at. In between, only its folders are: they change when
+a file is added, removed or replaced, but not when one is written in place."""
+
+
 @dataclass
 class _Seen:
-    """What a folder held, since when it has not changed, and whether it was returned like this."""
+    """What a capture held, since when it has not changed, and whether it was returned like this."""
 
     stamp: Stamp
     since: float
+    folders: dict[str, int]  # its folders, or the film, and when they changed, in nanoseconds
+    looked_at: float  # when the stamp was last compared with the files
     returned: bool = False
 
 
@@ -104,8 +111,8 @@ class Arrivals:
 
     A capture is complete when it contains a file named `marker`, or, without a marker, and for a film, when nothing in
     it has changed for `seconds`. Names that begin with a dot are left out, and `without`, such as the folder of the
-    results, which is no capture and lies in none. One that changes after it was returned is returned again. `clock`
-    never goes back.
+    results, which is no capture and lies in none. One that changes after it was returned is returned again; a file that
+    is written in place is noticed within SECONDS_BETWEEN_FILES. `clock` never goes back.
     """
 
     def __init__(
@@ -128,16 +135,21 @@ class Arrivals:
         Of two whose results have one name, such as a folder and a film, the second comes with the next call. Raises
         InputError if the folder cannot be read; later, all captures in it are returned again.
         """
-        found = {path: _stamp(path) for path in self._captures()}
-        self._seen = {path: seen for path, seen in self._seen.items() if path in found}
+        captures, now = self._captures(), self._clock()
+        self._seen = {path: self._seen[path] for path in captures if path in self._seen}
         ready: dict[str, Path] = {}
-        for path, stamp in found.items():
+        for path in captures:
             seen = self._seen.get(path)
+            recent = seen is not None and seen.returned and now - seen.looked_at < SECONDS_BETWEEN_FILES
+            if seen is not None and recent and all(_changed(place) == when for place, when in seen.folders.items()):
+                continue
+            stamp, folders = _stamp(path)
             if seen is None or seen.stamp != stamp:
-                seen = self._seen[path] = _Seen(stamp, self._clock())
+                seen = self._seen[path] = _Seen(stamp, now, folders, now)
+            seen.folders, seen.looked_at = folders, now
             if not stamp[0] or seen.returned:
                 continue
-            unchanged = self._clock() - seen.since >= self.seconds
+            unchanged = now - seen.since >= self.seconds
             by_time = self.marker is None or is_film(path)
             complete = unchanged if by_time else os.path.exists(path / str(self.marker))  # noqa: PTH110 - never raises
             name = path.stem if is_film(path) else path.name
@@ -155,15 +167,27 @@ class Arrivals:
         return [path for path in paths if path.resolve() not in self._left_out]
 
 
-def _stamp(capture: Path) -> Stamp:
-    """Return the stamp of a film, or of all files below a folder. Those that vanish meanwhile do not count."""
+def _changed(folder: str) -> int:
+    try:
+        return os.stat(folder).st_mtime_ns  # noqa: PTH116 - see _stamp
+    except OSError:
+        return -1
+
+
+def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
+    """Return the stamp of a film, or of all files below a folder, and the folders; see _Seen.
+
+    Files that vanish meanwhile do not count.
+    """
     count = size = newest = 0
+    folders = {}
     film = ("", (), [os.fspath(capture)])
     for place, _, names in [film] if is_film(capture) else os.walk(capture):
+        folders[place or os.fspath(capture)] = _changed(place or os.fspath(capture))
         for name in names:
             try:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
             except OSError:
                 continue
             count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns, status.st_ctime_ns)
-    return count, size, newest
+    return (count, size, newest), folders
