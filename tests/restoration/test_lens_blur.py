@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splinecli.capture.reader import capture_from_arrays
 from splinecli.restoration.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
 
 Images = NDArray[np.float32]
@@ -92,3 +93,23 @@ def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
     other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()
     remove_blur(other, mask, around)
     np.testing.assert_array_equal(part, other)
+
+
+def test_values_outside_the_mask_may_be_no_light() -> None:
+    images = blurred(discs(), 0.7)
+    mask = np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE // 2)) < SIDE / 3
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    images[3, ~mask] = np.nan
+    images[4, ~mask] = -1
+    capture = capture_from_arrays(images, lights, mask)
+    assert capture.removed_blur == pytest.approx(0.7, abs=0.2)
+
+
+def test_stored_values_stay_as_they_are() -> None:
+    images = blurred(discs(), 0.7)
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    capture = capture_from_arrays(images, lights, light_intensities=np.ones(8), as_stored=True)
+    assert capture.removed_blur is None
+    np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
+    sharpened = capture_from_arrays(images, lights, light_intensities=np.ones(8))
+    np.testing.assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)

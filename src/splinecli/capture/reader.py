@@ -23,6 +23,7 @@ from splinecli.capture.linearise import (
     Window,
     collect_observations,
     linear_light,
+    take_around,
 )
 from splinecli.capture.near_lamps import (
     NO_LAMP_OPTIONS,
@@ -284,7 +285,7 @@ def capture_from_arrays(
         for index, image in enumerate(stack):
             pixels = image if image.ndim == 3 else image[..., None]
             values, path = pixels[inside], Path(f"images[{index}]")
-            used = values if around is None else np.concatenate((values, pixels[around]))
+            used = values if around is None else np.concatenate((values, take_around(pixels, around)))
             yield StoredPixels(path, values, linear_light(used, path), intensities[index])
 
     observations, saturation, warnings, colours = collect_observations(pixels(), *sizes)
