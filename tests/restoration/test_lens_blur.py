@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.scenes import shade, sphere_cap, spiral_lights
 
 from splinecli.capture.reader import capture_from_arrays
 from splinecli.restoration.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
@@ -61,9 +62,12 @@ def test_fine_texture_stays_as_it_is() -> None:
     assert removed(images)[1] is None
 
 
-def test_images_without_edges_stay_as_they_are() -> None:
-    ramp = np.broadcast_to(np.linspace(0.2, 0.8, SIDE, dtype=np.float32), (8, SIDE, SIDE)).copy()
-    assert removed(np.full_like(ramp, 0.5))[1] is None
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+def test_images_without_edges_stay_as_they_are(gloss: float) -> None:
+    """Shading alone looks like the widest blur."""
+    shading = shade(sphere_cap(SIDE), spiral_lights(8, 60), gloss=gloss)
+    assert removed(np.moveaxis(shading, 2, 0).astype(np.float32))[1] is None
+    assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
 
 
 def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
