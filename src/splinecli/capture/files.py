@@ -186,11 +186,7 @@ def find_images(
 
 
 FILENAMES = "filenames.txt"
-LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
-_NAMED_LIGHTS = (".lp", "lights.json")  # endings of the names of light files that name the image of each light
 LIGHT_POSITIONS = ("light_positions.txt",)
-LIGHT_FILES = "light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt"
-"""The usual names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
@@ -255,18 +251,6 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
     return next((files[name] for name in names if name in files and is_found_file(files[name])), None)
-
-
-def find_lights(folder: Path) -> Path | None:
-    """Return the light file in the folder; None for none. Raises InputError for several that name their images."""
-    plain = find_named(folder, LIGHT_DIRECTIONS)
-    if plain is not None:
-        return plain
-    named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
-    if len(named) > 1:
-        problem = f"found {len(named)} light files: {', '.join(path.name for path in named)}"
-        raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
-    return named[0] if named else find_named(folder, LIGHT_POSITIONS)
 
 
 def folder_name(folder: Path) -> str:

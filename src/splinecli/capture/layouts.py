@@ -12,8 +12,6 @@ from pathlib import Path
 from splinecli.capture.files import (
     FILENAMES,
     GROUND_TRUTH,
-    LIGHT_DIRECTIONS,
-    LIGHT_FILES,
     LIGHT_INTENSITIES,
     MASK,
     NO_OVERRIDES,
@@ -23,14 +21,13 @@ from splinecli.capture.files import (
     Overrides,
     check_not_empty,
     find_images,
-    find_lights,
     find_named,
     folder_name,
     list_folder,
     list_images,
 )
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.light_files import read_light_directions
+from splinecli.capture.light_files import FORMATS, find_lights, light_names, read_light_directions
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
 
@@ -42,6 +39,7 @@ _BOUNDARIES = ("inboundary.png", "onboundary.png")
 _MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
 # Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
 _ENOUGH_MARKS = 2
+_USUAL_LIGHTS = [name for each in FORMATS if not each.rank for name in each.found]
 _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
@@ -91,7 +89,7 @@ def cyclesps_name(folder: Path) -> str | None:
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
     is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
-    if not (is_images_folder or _has_marks(folder)) or find_named(folder, LIGHT_DIRECTIONS) is not None:
+    if not (is_images_folder or _has_marks(folder)) or find_named(folder, _USUAL_LIGHTS) is not None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
@@ -193,7 +191,7 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    problem = f"found no capture, expected folders of images with a light file ({LIGHT_FILES})"
+    problem = f"found no capture, expected folders of images with a light file ({light_names()})"
     hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
     raise InputError(problem, path=folder, hint=hint)
 
@@ -237,7 +235,7 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         raise InputError(
-            f"the folder contains {len(images)} images but no light file ({LIGHT_FILES})",
+            f"the folder contains {len(images)} images but no light file ({light_names()})",
             path=folder,
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",

@@ -43,7 +43,7 @@ class Row(NamedTuple):
     """A row of numbers, its one-based line in the file, and this line as written, without comments."""
 
     numbers: tuple[float, ...]
-    line: int
+    line: int | None  # None in a file without lines, such as JSON
     text: str = ""
 
 
@@ -54,6 +54,8 @@ class NumberRows:
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
     names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
+    intensities: Doubles | None = None  # (R, 3), RGB, of the lights of a file that has them
+    are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
 
     def as_array(self) -> Doubles:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
