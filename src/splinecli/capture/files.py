@@ -9,12 +9,16 @@ import os.path
 import re
 import stat
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from splinecli.capture.formats.decoders import RAW_SUFFIXES
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
+from splinecli.capture_warnings import MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
@@ -154,11 +158,12 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         name = text.strip()
         if not name:
             continue
-        image = path.parent / name
+        places = (path.parent / each / name for each in ("", *IMAGE_FOLDERS))
+        image = next(filter(os.path.exists, places), None)  # Path.exists raises for a name that is too long
         if Path(name).is_absolute() or ".." in Path(name).parts:
             hint = "Copy the image into the folder, or set a link to it there, and name that"
             raise InputError(f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint)
-        if not os.path.exists(image):  # noqa: PTH110 - Path.exists raises for a name that is too long
+        if image is None:
             hint = "Correct the name or remove the line"
             raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
         check_file(image, "an image")
@@ -192,9 +197,12 @@ MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
     f"{stem}{suffix}"
-    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt")
+    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt", ".bmp")
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
+
+IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
+"""Names of folders that contain the images of the capture that is the folder around them; the first is PSBox's."""
 
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
@@ -221,6 +229,7 @@ class CaptureFiles:
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
     others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
+    warnings: tuple[CaptureWarning, ...] = ()  # what was chosen among files whose names are not the usual ones
 
 
 @dataclass(frozen=True)
@@ -251,6 +260,45 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
     return next((files[name] for name in names if name in files and is_found_file(files[name])), None)
+
+
+_MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
+
+
+def is_mask_name(path: Path) -> bool:
+    """Return whether a picture's name has the word "mask", as NAME_mask.png and chrome.mask.tga, but is no result."""
+    stem = path.stem.lower()
+    is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
+    return is_picture and _MASK_WORD.search(stem) is not None
+
+
+def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
+    """Return the mask of photographs that have none with a usual name, and a warning that says which; None for none.
+
+    It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
+    name; or else the alpha channel of the first photograph. Of several pictures, none is chosen.
+    """
+    name, of_images = folder_name(folder).lower(), images[0].parent
+    entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
+    with suppress(InputError):  # what is beside a folder is not always ours to read
+        around = list_folder(folder.absolute().parent)
+        entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
+    named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
+    try:
+        size = read_facts(images[0]).size[0] if named else ()
+        masks = [path for path in named if read_facts(path).size[0][:2] == size[:2]]
+        if not named and read_facts(images[0]).stated_channels in (2, 4):
+            masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
+    except InputError:  # reading the images names the damage
+        return None, ()
+    if not masks:
+        return None, ()
+    text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
+    if masks[0] in images:
+        text = f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for another one."
+    if len(masks) > 1:
+        text = f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with --mask FILE."
+    return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 
 
 def folder_name(folder: Path) -> str:

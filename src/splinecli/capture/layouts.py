@@ -12,6 +12,7 @@ from pathlib import Path
 from splinecli.capture.files import (
     FILENAMES,
     GROUND_TRUTH,
+    IMAGE_FOLDERS,
     LIGHT_INTENSITIES,
     MASK,
     NO_OVERRIDES,
@@ -20,14 +21,17 @@ from splinecli.capture.files import (
     NoImagesError,
     Overrides,
     check_not_empty,
+    choose_mask,
     find_images,
     find_named,
     folder_name,
+    is_mask_name,
     list_folder,
     list_images,
 )
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import FORMATS, find_lights, light_names, read_light_directions
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
 
@@ -144,8 +148,11 @@ _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all
 _MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
 
 
-PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
-"""The names of the light file and of the folder of images, in the layout of PSBox (Y. Xiong)."""
+PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+
+
+def _is_other(image: Path) -> bool:
+    return not _OTHER_WORDS.isdisjoint(_WORD.findall(image.stem.lower()))
 
 
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
@@ -171,7 +178,21 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 def capture_name(folder: StrPath) -> str:
     """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
-    return folder.stem if is_film(folder) else cyclesps_name(folder) or folder_name(folder)
+    return folder.stem if is_film(folder) else cyclesps_name(folder) or _own_name(folder)
+
+
+def _own_name(folder: Path) -> str:
+    """Return the name of a folder, of a folder `images` that of the folder around it. Raises InputError."""
+    name = folder_name(folder)
+    return folder_name(_parent(folder)) if name in IMAGE_FOLDERS and _parent(folder) != folder else name
+
+
+def _images_folder(folder: Path) -> Path | None:
+    """Return the folder of images of a capture without images of its own; None for none."""
+    inside = next((path for name in IMAGE_FOLDERS if is_folder(path := folder / name)), None)
+    if inside is None or not all(map(_is_other, list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS))):
+        return None
+    return inside if list_images(inside, leave_out_stems=NOT_PHOTOGRAPHS) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -203,10 +224,12 @@ def _subfolders(folder: Path) -> list[Path]:
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
-        objects = folder / PSBOX_IMAGES
+        objects = folder / IMAGE_FOLDERS[0]
         is_psbox = is_folder(objects) and find_named(folder, PSBOX_LIGHTS) is not None
-        if find_named(folder, [FILENAMES]) is not None or list_images(
-            objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
+        if (
+            find_named(folder, [FILENAMES]) is not None
+            or list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS)
+            or _images_folder(folder) is not None
         ):
             return [folder]
     return list_cyclesps(folder) or []
@@ -227,8 +250,10 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
-    images, listed = find_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
+    listed = find_named(folder, [FILENAMES]) is not None
+    of_images = folder if listed else _images_folder(folder) or folder
+    images, _ = find_images(of_images, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    others = tuple(filter(_is_other, images))
     if listed or len(others) > _MOST_OTHERS * len(images):
         others = ()
     images = tuple(image for image in images if image not in others)
@@ -250,7 +275,7 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
 def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
     lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
-    objects = folder / PSBOX_IMAGES
+    objects = folder / IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
     images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
@@ -271,14 +296,19 @@ def _gather(
 
     Files that the user names come before those of the folder.
     """
+    mask, warnings = overrides.mask or find_named(folder, MASK), tuple[CaptureWarning, ...]()
+    if mask is None:
+        mask, warnings = choose_mask(folder, images)
+        others = tuple(path for path in others if not warnings or not is_mask_name(path))
     return CaptureFiles(
         layout,
-        folder_name(folder),
+        _own_name(folder),
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
+        mask=mask,
         ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
         others=others,
+        warnings=warnings,
     )

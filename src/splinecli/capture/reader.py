@@ -103,6 +103,7 @@ def open_capture(
     stamp = stamp_files(files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera))
     in_folder = files.images
     files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    warnings += files.warnings
     if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
         flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
         radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
@@ -122,7 +123,7 @@ def open_capture(
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
         text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
-        text += " the lights. To use it, list all images in filenames.txt."
+        text += " the lights. To use it as one, list all images in filenames.txt."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve

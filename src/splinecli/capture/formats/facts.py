@@ -82,6 +82,11 @@ class ImageFacts:
     exif: Mapping[int, Any] | None = field(default_factory=dict)
     damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
 
+    @property
+    def stated_channels(self) -> int | None:
+        """The number of channels, with alpha; None where the header states none."""
+        return None if self.stated_size is None else (*self.stated_size[0], 1)[2]
+
     @cached_property
     def size(self) -> StoredSize:
         """The size as stored. Raises InputError for a damaged file. Opening a RAW file takes long."""
