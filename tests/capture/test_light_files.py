@@ -270,5 +270,5 @@ def test_a_format_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.Monk
     assert find_capture_files(tmp_path).light_directions == lights
     np.testing.assert_allclose(read_lights(lights, 4), DIRECTIONS, atol=1e-15)
     assert light_files.light_suffixes().endswith(", .bars")
-    with pytest.raises(UsageError, match=r"type \.bars are only read\. Write \.txt, \.npy or \.lp"):
+    with pytest.raises(UsageError, match=r"type \.bars are only read\. Write \.txt, \.npy, \.lp or \.csv"):
         light_files.check_writable(lights)

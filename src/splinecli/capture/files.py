@@ -8,17 +8,18 @@ import json
 import os.path
 import re
 import stat
+from collections import Counter
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.formats.decoders import RAW_SUFFIXES
+from splinecli.capture.formats.decoders import RAW_SUFFIXES, page_of, pages
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
-from splinecli.capture_warnings import MASK_CHOICE, CaptureWarning
+from splinecli.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
@@ -81,8 +82,10 @@ PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # images only where a folder has no others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
-IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)  # suffixes of images of an object
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
+IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
 
 _DIGITS = re.compile(r"([0-9]+)")
 
@@ -117,9 +120,9 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
-    Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
-    replaces it. A JPEG is a copy that the camera made, and does not count. What is left out has another meaning, by its
-    stem in lower case, such as "mask", or as a file that the user named.
+    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is a
+    copy that the camera or a viewer made, and does not count. What is left out has another meaning, by its stem in
+    lower case, such as "mask", or as a file that the user named.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -130,21 +133,43 @@ def list_images(
         and is_found_file(entry)
         and resolve(entry) not in others
     ]
-    names = [(image.stem.lower(), image.suffix.lower()) for image in images]
-    raw = {stem for stem, suffix in names if suffix in RAW_SUFFIXES}
-    developed = {stem for stem, suffix in names if suffix in _DEVELOPED}
-    return tuple(
-        image
-        for image, (stem, suffix) in zip(images, names, strict=True)
-        if stem not in raw or suffix in (_DEVELOPED if stem in developed else RAW_SUFFIXES)
-    )
+    images = [image for image in images if image.suffix.lower() not in _RARE] or images
+    best: dict[str, int] = {}
+    for image in images:
+        best[image.stem.lower()] = min(_rank(image), best.get(image.stem.lower(), len(_KINDS)))
+    return tuple(image for image in images if _rank(image) == best[image.stem.lower()])
+
+
+def _rank(image: Path) -> int:
+    return next(rank for rank, suffixes in enumerate(_KINDS) if image.suffix.lower() in suffixes)
+
+
+def copies(images: Sequence[Path]) -> list[CaptureWarning]:
+    """Say which images were left out because another file of the same stem shows the same photograph."""
+    images = [page_of(image)[0] for image in images]
+    stems = {image.stem.lower() for image in images}
+    others = [
+        entry
+        for folder in {image.parent for image in images}
+        for entry in list_folder(folder)
+        if entry.suffix.lower() in IMAGE_SUFFIXES and entry.stem.lower() in stems and entry not in images
+    ]
+    if not others:
+        return []
+    kinds, used = (", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images))
+    text = f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the same photographs, and"
+    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} are left out.")]
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
+        suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
+        found = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common(3))
         raise NoImagesError(
-            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images"
+            "the folder contains no images" + (f", but files of the types {found}" if found else ""),
+            path=folder,
+            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images",
         )
 
 
@@ -187,6 +212,8 @@ def find_images(
         return read_image_list(filenames), True
     images = list_images(folder, leave_out_stems=leave_out_stems, leave_out=leave_out)
     check_not_empty(images, folder)
+    if len(images) == 1 and images[0].suffix.lower() in (".tif", ".tiff"):
+        images = tuple(pages(images[0]))
     return images, False
 
 
@@ -229,6 +256,7 @@ class CaptureFiles:
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
     others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
+    kept: tuple[int, ...] | None = None  # zero-based places in the light file of the images; None for all
     warnings: tuple[CaptureWarning, ...] = ()  # what was chosen among files whose names are not the usual ones
 
 
@@ -342,6 +370,7 @@ def digest(stamp: Sequence[Any]) -> str:
 
 
 def _path_size_and_time(path: Path) -> tuple[str, int, int]:
+    stored, page = page_of(path)
     with reading(path):
-        status = path.stat()
-        return str(path.resolve()), status.st_size, status.st_mtime_ns
+        status = stored.stat()
+        return str(stored.resolve()) + f"[{page}]" * (page > 0), status.st_size, status.st_mtime_ns

@@ -7,6 +7,7 @@ for each line of the object's light.txt: 00000.tif and so on. A capture is one s
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture.files import (
@@ -22,6 +23,7 @@ from splinecli.capture.files import (
     Overrides,
     check_not_empty,
     choose_mask,
+    copies,
     find_images,
     find_named,
     folder_name,
@@ -30,7 +32,7 @@ from splinecli.capture.files import (
     list_images,
 )
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.light_files import FORMATS, find_lights, light_names, read_light_directions
+from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
 from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
@@ -259,17 +261,21 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
+        option = light_option([folder, _parent(folder)], len(images))
         raise InputError(
             f"the folder contains {len(images)} images but no light file ({light_names()})",
             path=folder,
-            hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
+            hint=f"Add {option}"
+            if option
+            else "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
     layout, ground_truth = "plain folder", GROUND_TRUTH
     if listed and find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    return _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    files = _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    return files if listed else replace(files, warnings=(*files.warnings, *copies(images)))
 
 
 def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:

@@ -7,7 +7,9 @@ images of the folder are matched to them by base name, then by name without suff
 """
 
 import io
+import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -18,6 +20,7 @@ from splinecli.capture import light_formats
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
 from splinecli.capture.formats.numbers import (
     DECIMAL_POINT,
+    MOST_TEXT,
     NumberRows,
     columns,
     has_decimal_commas,
@@ -86,7 +89,7 @@ FORMATS = (
         "JSON list", (".json",), light_formats.read_json_list, ("light_directions.json",), 2, light_formats.is_list
     ),
     LightFormat("AliceVision", (".json",), light_formats.read_alicevision, ("*lights.json",), 1),
-    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2),
+    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
     LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
     LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )
@@ -122,6 +125,29 @@ def find_lights(folder: Path) -> Path | None:
         if paths:
             return paths[0]
     return find_named(folder, LIGHT_POSITIONS)
+
+
+_SLANT_WORD, _NO_LIGHTS = re.compile("slant|tilt"), re.compile("intens|camera|filenames|lobes")
+_MOST_TRIED = 50  # files of a folder
+
+
+def light_option(folders: Sequence[Path], n_images: int) -> str | None:
+    """Return the options that read a file in one of the folders as lights; None for no such file."""
+    suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
+    for folder in folders:
+        with suppress(InputError, OSError):
+            entries = [e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)]
+            entries.sort(key=lambda e: "light" not in e.name.lower())
+            for path in entries[:_MOST_TRIED]:
+                name = path.name.lower()
+                if _NO_LIGHTS.search(name) or path.stat().st_size > MOST_TEXT:
+                    continue
+                angles: RowForm = "slant-tilt" if _SLANT_WORD.search(name) else "azel"
+                for form in ("xyz", angles):
+                    with suppress(InputError):
+                        read_lights(path, n_images, form=form)
+                        return f"--lights {path}" + (f" --lights-format {form}" if form != "xyz" else "")
+    return None
 
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
@@ -309,7 +335,9 @@ def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_imag
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
-    problem = f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image"
+    count = len(readings[0][0])
+    what = {"light directions": "light direction", "lights": "light"}.get(what, what) if count == 1 else what
+    problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
     raise InputError(problem, path=table.path, hint=hint)
 
@@ -368,7 +396,7 @@ def read_lights(
     """
     table = read_light_table(path, n_images, form)
     n_rows = n_images if table.names is None else None
-    _, directions = lights_of(table, n_rows, frame, form, leave_bad=True)
+    _, directions = lights_of(table, n_rows, frame, form, leave_bad=form != "positions")
     if table.names is None:
         return directions
     return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions, table.intensities)
@@ -378,8 +406,9 @@ def check_writable(path: Path) -> None:
     """Raise UsageError for a light file whose format is only read."""
     suffix = path.suffix.lower()
     if _written_as(suffix) is None:
-        written = ".txt, " + " or ".join(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes)
-        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=f"Write {written}")
+        *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))
+        hint = f"Write {', '.join(most)} or {last}"
+        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=hint)
 
 
 def encode_lights(path: Path, directions: Doubles, images: Sequence[Path]) -> bytes:

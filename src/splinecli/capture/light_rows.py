@@ -194,8 +194,8 @@ def counts_rows(column: list[float]) -> int | None:
 
 _FOLDERS = re.compile(r"[/\\]")
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
-_ANGLE = re.compile(r"(az|el|alt)")
-_AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
+_ANGLE = re.compile(r"(az|el|alt|slant|tilt)")
+_AXES, _ANGLES, _SLANTS = ("x", "y", "z"), ("az", "el"), ("slant", "tilt")
 
 
 def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
@@ -236,9 +236,9 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
 
 
 def _order_of(header: list[str]) -> list[int]:
-    """Return the places of x, y and z, or of azimuth and elevation, in a header; their usual places in any other."""
+    """Return the places of x, y and z, azimuth and elevation, or slant and tilt in a header; else the usual places."""
     words = [word.lower().strip("\"'") for word in header]
-    for pattern, wanted in ((_AXIS.fullmatch, _AXES), (_ANGLE.match, _ANGLES)):
+    for pattern, wanted in ((_AXIS.fullmatch, _AXES), (_ANGLE.match, _ANGLES), (_ANGLE.match, _SLANTS)):
         found = [match[1].replace("alt", "el") for word in words if (match := pattern(word))]
         if len(words) == len(wanted) and sorted(found) == sorted(wanted):
             return [found.index(name) for name in wanted]

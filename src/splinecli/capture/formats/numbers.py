@@ -152,6 +152,9 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
     content = [(line, text) for line, text in content if text.strip(" ,;")]
+    if content and content[0][1][0] in "[(":  # a list as Python or NumPy prints it
+        parts = [(line, part) for line, text in content for part in re.split(r"[\])]", text)]
+        content = [(line, text) for line, part in parts if (text := part.strip(" \t,;[("))]
     commas = uses_decimal_commas([text for _, text in content], n_numbers)
     return [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
 
