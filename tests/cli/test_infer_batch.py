@@ -82,7 +82,7 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     links = re.findall(r'href="([^"]+)"', index)
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
     assert all((Path("out") / unquote(link)).is_file() for link in links)
-    assert "found neither PNG, TIFF, JPEG nor BMP" in index
+    assert "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC" in index
     pages = re.findall(r'<img src="data:image/jpeg;base64,([^"]+)" alt="Normal map of ([^"]+)"', index)
     assert [name for _, name in pages] == ["sphere", "a b"]
     normals = cv2.imread("out/sphere/normals.png", cv2.IMREAD_UNCHANGED) / 257

@@ -165,9 +165,9 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
-        found = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common(3))
+        found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
         raise NoImagesError(
-            "the folder contains no images" + (f", but files of the types {found}" if found else ""),
+            "the folder contains no images" + (f", but {found}" if found else ""),
             path=folder,
             hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images",
         )
