@@ -16,7 +16,7 @@ from PIL import Image
 
 import scenes
 from splinecli.calibration.balls import find_ball_files
-from splinecli.capture import CaptureSource, open_capture
+from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
 from splinecli.diagnosis.checks import check_evidence
@@ -45,11 +45,11 @@ def folder(tmp_path: Path) -> Path:
 
 def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
     """Compare the normals with the geometry, and return the codes of the warnings."""
-    capture = source.read()
+    capture = source.read(as_stored=True)
     assert mask is None or (capture.mask == mask).all()
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     inside = capture.mask & DISC
-    # 16-bit values, without shadows: least squares is exact to a few thousandths of a degree.
+    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a degree.
     assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
     return [warning.code for warning in capture.warnings]
 
@@ -219,6 +219,7 @@ def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) 
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
     assert "no light for them, and the other images have another form of name" in str(source.warnings[0])
+    assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
     for number in (12, 13):
         picture(folder / f"{number:03}.png", PICTURES[0])
     with pytest.raises(InputError, match=r"found 12 light directions, expected 17.* none is left for 012\.png"):
@@ -269,7 +270,7 @@ def test_display_encoded_formats(folder: Path, suffix: str) -> None:
         options = {"lossless": True} if suffix == ".webp" else {"quality": 100}
         Image.fromarray(np.dstack([image] * 3)).save(folder / f"{number:03}{suffix}", **options)
     picture(folder.parent / "mask.png", MASK)
-    capture = open_capture(folder, mask=folder.parent / "mask.png").read()
+    capture = open_capture(folder, mask=folder.parent / "mask.png").read(as_stored=True)
     assert "display_decoded" in [warning.code for warning in capture.warnings]
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     # Steps of 8 bits are half a percent of the brightness.

@@ -147,14 +147,17 @@ _WORD = re.compile(r"[a-z]+")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 """Words in the names of pictures that other programs leave beside the photographs."""
 
+_RESULT_WORDS = frozenset({"demo", "result", "results"})
+"""The same, where no light file says how many photographs there are."""
+
 _MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
 
 
 PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
 
 
-def _is_other(image: Path) -> bool:
-    return not _OTHER_WORDS.isdisjoint(_WORD.findall(image.stem.lower()))
+def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
+    return not words.isdisjoint(_WORD.findall(image.stem.lower()))
 
 
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
@@ -255,7 +258,8 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
     listed = find_named(folder, [FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
     images, _ = find_images(of_images, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    others = tuple(filter(_is_other, images))
+    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | _RESULT_WORDS
+    others = tuple(image for image in images if _is_other(image, words))
     if listed or len(others) > _MOST_OTHERS * len(images):
         others = ()
     images = tuple(image for image in images if image not in others)
