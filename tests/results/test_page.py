@@ -68,7 +68,7 @@ def test_figures_and_pictures() -> None:
     assert page.facts == {
         "Mean": "9.06°", "Median": "6.24°", "90th percentile": "18.10°", "Under 5°": "37.2%", "Under 10°": "75.0%",
         "Method": "spline-net", "Weights": "blobby-7", "Lights": "10", "Pixels": "45,200", "Size": "296 × 321",
-        "Likely within 5°": "81% of the pixels", "Seconds": "read 0.6, estimate 0.008", "Device": "cpu, float32",
+        "Likely within 5°": "81% of the pixels", "Seconds": "read 0.6", "Device": "cpu, float32",
     }  # fmt: skip
     assert page.text["li"] == ["The images are 8-bit."]
     assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]

@@ -17,7 +17,15 @@ import cv2
 import numpy as np
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
-from splinecli.capture.files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
+from splinecli.capture.files import (
+    MASK,
+    NOT_PHOTOGRAPHS,
+    choose_mask,
+    find_images,
+    find_named,
+    is_mask_name,
+    list_images,
+)
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
 from splinecli.capture.near_lamps import read_camera_matrix
@@ -239,10 +247,12 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
 
     A mask that is given replaces the one in the folder. Raises InputError where there are no images.
     """
-    images, _ = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
+    images, listed = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
+    if not listed and 2 * sum(map(is_mask_name, images)) < len(images):  # such as chrome.mask.tga
+        images = tuple(image for image in images if not is_mask_name(image))
     others = list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
-    return BallFiles(folder, images, reference, mask or find_named(folder, MASK))
+    return BallFiles(folder, images, reference, mask or find_named(folder, MASK) or choose_mask(folder, images)[0])
 
 
 def calibrate_ball(

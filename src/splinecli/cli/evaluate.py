@@ -31,7 +31,9 @@ def evaluate(
     n_lights: list[str] | None = Option(
         None, metavar="K|all", help="Number of lights in each draw. May be repeated. [default: 10]"
     ),
-    trials: int | None = Option(None, metavar="T", min=1, help="Number of random draws. [default: 100]"),
+    trials: int | None = Option(
+        None, metavar="T", min=1, help="Number of random draws. [default: 100; 10 of four methods or more]"
+    ),
     seed: int = shared.SEED,
     draws: Path | None = Option(
         None, metavar="FILE", help="Draws of lights: each line has light indices, counted from 0."

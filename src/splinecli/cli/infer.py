@@ -317,6 +317,7 @@ def info(
     white_level: float | None = shared.WHITE_LEVEL,
     light_frame: str | None = shared.LIGHT_FRAME,
     lights_format: shared.LightForm = shared.LIGHTS_FORMAT,
+    auto_mask: bool = Option(False, "--auto-mask", help="If there is no mask, find the object in the images."),
     check_lights: bool = Option(
         False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
     ),
@@ -350,6 +351,7 @@ def info(
         plot=plot,
         overwrite=overwrite,
         check_lights=check_lights,
+        auto_mask=auto_mask,
         mended_lights=mended_lights,
     )
     print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)

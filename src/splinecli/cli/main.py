@@ -53,7 +53,7 @@ PANELS = {
     },
     "watch": {"Captures": "marker settle"},
     "info": {
-        "Input": "mask crop scale ground-truth transfer ambient flat-field white-level",
+        "Input": "mask auto-mask crop scale ground-truth transfer ambient flat-field white-level",
         "Lights": "lights first-light light-frame lights-format intensities light-positions light-distance pixel-size"
         " object-width camera-matrix check-lights mended-lights",
         "Output": "plot strict overwrite json quiet",

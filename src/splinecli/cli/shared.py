@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from typer import Option
 
+from splinecli.capture.light_files import light_suffixes
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -181,8 +182,8 @@ PIXEL_SIZE = "Near lamps: the width of a pixel on the object. [default: pixel_si
 LIGHTS = Option(
     None,
     metavar="FILE|estimate",
-    help="Light directions: a line x y z for each image, z to the camera. estimate finds them from the images, less"
-    " exactly. [default: the light file in CAPTURE]",
+    help=f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate finds them from the"
+    " images, less exactly. [default: the light file in CAPTURE]",
 )
 FIRST_LIGHT = Option(
     None,

@@ -112,8 +112,8 @@ def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
 
 def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
     if seen.background > MOST_BACKGROUND:
-        text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
-        text += " background mean nothing. Add --auto-mask, or give a mask."
+        text = f"{100 * seen.background:.0f} % of the pixels are near black. If they are background, their normals mean"
+        text += " nothing: add --auto-mask, or give a mask."
         yield CaptureWarning(codes.NO_MASK, text)
 
 

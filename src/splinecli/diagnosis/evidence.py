@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import CaptureSource
+from splinecli.capture.formats.decoders import page_of
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.light_check import LightCheck, check_lights
@@ -63,7 +64,7 @@ class Evidence:
         (sample, closeup), lamps = samples, source.lamps
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
-            copies = equal_files(images)
+            copies = equal_files(images) if page_of(images[0])[0] == images[0] else []
         return cls(
             [image.name for image in images],
             source.light_directions,

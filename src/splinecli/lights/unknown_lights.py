@@ -287,9 +287,10 @@ def find_lights(
     _check_different(observations)
     outlined = outline_share(mask) >= LEAST_OUTLINE
     if refuse and first_light is None and not outlined:
+        remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
         raise InputError(
             "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
-            hint="If the images show the whole object, give its mask, or add --auto-mask. Else say where the light of"
+            hint=f"If the images show the whole object, {remedy}. Else say where the light of"
             " the first image that is used comes from: --first-light left, upper-left, or its azimuth in degrees,"
             " counter-clockwise from the right",
         )

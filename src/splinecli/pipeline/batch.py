@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 from splinecli import __version__
 from splinecli.capture import capture_name
-from splinecli.capture.files import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
+from splinecli.capture.files import IMAGE_SUFFIXES, MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
@@ -69,9 +69,12 @@ class Member:
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
     """Return the captures in the order given. A folder that is given twice counts once.
 
-    Raises UsageError if two captures have the same name, or a "folder" that does not exist is the name of a map, format
-    or method.
+    Raises UsageError if images are given in place of their folder, two captures have the same name, or a "folder" that
+    does not exist is the name of a map, format or method.
     """
+    if folders and all(path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path) for path in folders):  # noqa: PTH113
+        given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
+        raise UsageError(f"{given} given, expected their folder", hint=f"Pass the folder: {folders[0].parent}")
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)
     if shard is not None:

@@ -31,6 +31,7 @@ from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
 
 DEFAULT_TRIALS = 100
+TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
 DEFAULT_LIGHTS = 10
 
 
@@ -45,7 +46,8 @@ class EvaluateOptions:
         n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
             number in the draws file.
         light_noise_deg: one evaluation for each.
-        trials: None for DEFAULT_TRIALS. jobs: None for the cores, or for 1 on a GPU.
+        trials: None for DEFAULT_TRIALS, or for TRIALS_OF_MANY of MANY_METHODS or more. jobs: None for the cores, or for
+            1 on a GPU.
         pixels: (row, column) of each.
         cluster: the processes or machines that score trials; None for this process.
     """
@@ -109,11 +111,12 @@ class EvaluateOptions:
     @property
     def protocols(self) -> list[Protocol]:
         """One protocol for each number of lights and each light noise. Raises UsageError."""
+        usual = TRIALS_OF_MANY if len(set(self.methods)) >= MANY_METHODS else DEFAULT_TRIALS
         counts = self.n_lights or ((DEFAULT_LIGHTS,) if self.draws is None else (None,))
         return [
             Protocol(
                 count,
-                DEFAULT_TRIALS if self.trials is None else self.trials,
+                usual if self.trials is None else self.trials,
                 self.seed,
                 None if self.draws is None else Path(self.draws),
                 noise,

@@ -204,6 +204,8 @@ def infer_capture(
             light_file=source.files.light_directions,
             distillation=None if distilled is None else distilled.report(),
         )
+        if source.light_numbers is not None:
+            report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
         found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
@@ -247,7 +249,7 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
     if options.auto_mask:
         with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
             source = source.find_mask(lambda: advance(1))
-    indices = options.light_indices
+    indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)

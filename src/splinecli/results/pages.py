@@ -201,7 +201,10 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
         ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
         *([] if reduced is None else [("Size on this page", reduced)]),
-        ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:g}" for name, n in seconds if n and name != "total")),
+        (
+            "Seconds",
+            ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in seconds if n >= 0.05 and name != "total"),
+        ),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
 
