@@ -104,7 +104,6 @@ def estimate_normals(
     import numpy as np
 
     from splinecli.capture.reader import capture_from_arrays
-    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
     from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator
@@ -135,7 +134,7 @@ def estimate_normals(
     check = partial(check_arrays, intensities=given)
     estimate, _ = estimate_capture(capture, estimator, check, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
-        if warning.code in PROBABLY_WRONG:
+        if warning.is_error:
             warn(str(warning), stacklevel=2)
     return estimate
 

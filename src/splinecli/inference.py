@@ -28,7 +28,7 @@ from splinecli.lights.indirect_light import IndirectLight, PixelPlaces, find_ind
 from splinecli.lights.lamp_light import LampLight, LightOf, Rows, flat_depth, parts_of_rows, surface_points
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator, make_estimator
-from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
+from splinecli.methods.estimator import TILE_PIXELS, confidence
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
@@ -162,7 +162,7 @@ def _estimate(
         stage,
     )
     normals, errors = found.normals, found.errors
-    refiner = refiner_of(estimator)
+    refiner = estimator.refiner
     if refiner is not None and errors is not None:
         with (stage or _no_stage)("refining") as advance:
             refiner.refine(capture.mask, capture.observations, found.light_of, normals, errors, progress=advance)
@@ -207,22 +207,20 @@ def estimate_pixels(
         light_without: gives the light of some pixels without indirect light, or with all that there is.
         tile_pixels, progress, stage: see estimate_normals.
     """
-    if tile_pixels is None:
-        tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
+    tile_pixels = tile_pixels or estimator.tile_pixels
     n_pixels = len(observations)
     normals = np.empty((n_pixels, 3), np.float32)
-    errors = np.empty((n_pixels, 2), np.float32) if tells_confidence(estimator) else None
+    errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
     def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
-        if errors is not None and tells_confidence(estimator):
-            found, errors[rows] = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
-        else:
-            found = estimator.estimate(light.observations, light.directions, progress=progress)
+        found, of_rows = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
+        if errors is not None:
+            errors[rows] = of_rows
         normals[rows] = light.in_frame_of_capture(found)
 
     light_of = partial(light_without, None)
-    refiner = refiner_of(estimator)
-    estimator = for_capture(estimator, light_of, n_pixels)
+    refiner = estimator.refiner
+    estimator = estimator.bind(light_of, n_pixels)
     for rows in parts_of_rows(n_pixels, tile_pixels):
         estimate(rows, light_of(rows), progress)
     if refiner is None or errors is None:
@@ -232,7 +230,7 @@ def estimate_pixels(
         if indirect is not None:
             light_of = partial(light_without, indirect)
             # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
-            estimator = see_anew(estimator, light_of, n_pixels)
+            estimator = estimator.rebind(light_of, n_pixels)
             for rows in parts_of_rows(n_pixels, tile_pixels):
                 changed = rows[indirect.counts_at(observations[rows], rows)]
                 if len(changed):

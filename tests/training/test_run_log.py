@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from scenes import decode_rgb
-from splinecli.capture.files import CURVES, TRAINING_MAPS
+from splinecli.output_files import CURVES, TRAINING_MAPS
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.loop import Trainer

@@ -296,11 +296,11 @@ def light_warnings(
     """
     warnings = []
     if check.order is not None:
-        code = codes.LIGHT_FRAME if check.order in (ZENITH, HALF_VECTORS) else codes.LIGHT_ORDER
-        warnings.append(CaptureWarning(code, _order_text(check, light_file), check.error_deg))
+        kind = codes.LIGHT_FRAME if check.order in (ZENITH, HALF_VECTORS) else codes.LIGHT_ORDER
+        warnings.append(CaptureWarning(kind, _order_text(check, light_file), check.error_deg))
     if check.best is not None:
-        code = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
-        warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file), check.error_deg))
+        kind = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
+        warnings.append(CaptureWarning(kind, _frame_text(check, check.best, frame, light_file), check.error_deg))
     if check.lacks_shadows:
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not in the images. With"

@@ -263,15 +263,15 @@ def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats 
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
         return _shifted(normals, truth, sample)
     frame = _FRAMES[best]
-    code, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
+    kind, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
     if frame.signs[2] < 0:
-        code, lights = codes.GROUND_TRUTH_Z, ""
+        kind, lights = codes.GROUND_TRUTH_Z, ""
     text = (
         f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
         f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
     )
     # Either the ground truth or the normals are wrong by this angle.
-    return [CaptureWarning(code, text, angles[0] if code == codes.GROUND_TRUTH_FRAME else None)]
+    return [CaptureWarning(kind, text, angles[0] if kind == codes.GROUND_TRUTH_FRAME else None)]
 
 
 def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWarning]:

@@ -152,7 +152,7 @@ class CaptureSummary:
             text = (
                 f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis; lower lights give better normals."
             )
-            found.append(CaptureWarning(codes.HIGH_LIGHTS, text))
+            found.append(CaptureWarning(codes.LIGHTS_NEAR_AXIS, text))
         return found
 
     def _dark_images(self, dark: Sequence[ImageSummary]) -> CaptureWarning:

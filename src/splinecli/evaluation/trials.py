@@ -26,7 +26,6 @@ from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import refiner_of
 from splinecli.system.files import as_splinecli_error, parse_json, refusals_as_output_errors, write_text
 from splinecli.system.progress import Progress
 from splinecli.system.publishing import is_plain
@@ -207,7 +206,7 @@ class SharedDraw:
         `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
         SplinecliError if the method returns normals that are not unit vectors.
         """
-        source, whole = self._source, refiner_of(estimator) is not None
+        source, whole = self._source, estimator.refiner is not None
         with self._lock:
             if whole not in self._captures:
                 self._captures[whole] = source.see(trial, whole=whole)
@@ -306,7 +305,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
             f"{name}: the first {damaged} images are known to be damaged and are used;"
             f" --skip-first {name}={damaged} leaves them out."
         )
-    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN]
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.kind == GROUND_TRUTH_UPSIDE_DOWN]
     if capture.ground_truth is not None:
         sample = sample_observations(capture.observations, capture.mask)
         wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)

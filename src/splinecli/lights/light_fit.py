@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.record import Capture
-from splinecli.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
+from splinecli.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECTED, CaptureWarning
 from splinecli.errors import UsageError
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
 from splinecli.maths import Doubles, Floats, Singles
@@ -236,7 +236,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        kept = CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {_why_kept(capture)}.")
+        kept = CaptureWarning(REFINEMENT_REJECTED, f"The light directions were not refined: {_why_kept(capture)}.")
         return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:

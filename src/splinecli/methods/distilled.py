@@ -24,13 +24,11 @@ from splinecli.methods.estimator import (
     FEWEST_PIXELS,
     TOWARDS_CAMERA,
     UNKNOWN_ERROR,
-    ConfidentEstimator,
     Directions,
+    Estimator,
     Observations,
     StudentSize,
     directions_at,
-    for_capture,
-    refiner_of,
 )
 from splinecli.networks.li_ne_net import median_error_deg
 from splinecli.system.machine import one_thread_each, side_by_side
@@ -234,16 +232,16 @@ class Distillation:
         return self.mean_deg <= _LARGEST_SHARE * self.expected_deg
 
 
-class DistilledEstimator:
+class DistilledEstimator(Estimator):
     """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see distil."""
 
-    tells_confidence = True
+    has_confidence = True
     tile_pixels = 1 << 18
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
         self,
-        teacher: ConfidentEstimator,
+        teacher: Estimator,
         perceptron: Perceptron,
         sample: PixelSample,
         found: Distillation,
@@ -253,16 +251,13 @@ class DistilledEstimator:
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
-        self.refiner = refiner_of(teacher)
+        self.refiner = teacher.refiner
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
-    def learn_anew(self, light_of: LightOf, n_pixels: int) -> ConfidentEstimator:
-        """Learn the capture again after its observations changed. Return the network if it cannot be learned.
-
-        The arguments are those of `distil`.
-        """
-        teacher = for_capture(self._teacher, light_of, n_pixels)
+    def rebind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+        """Learn the capture again after its observations changed. Return the network if it cannot be learned."""
+        teacher = self._teacher.bind(light_of, n_pixels)
         try:
             learned = distil(teacher, light_of, n_pixels, self._size)
         except UsageError:  # too few pixels are still lit
@@ -289,7 +284,7 @@ class DistilledEstimator:
     def estimate_with_error(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see ConfidentEstimator."""
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see Estimator."""
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
         unlike = np.empty(len(observations), np.bool_)  # the pixels that are rare, or unlike the sample
 
@@ -310,14 +305,15 @@ class DistilledEstimator:
                 progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
-            normals[unlike], errors[unlike] = self._teacher.estimate_with_error(
+            taught = self._teacher.estimate_with_error(
                 observations[unlike], directions_at(light_directions, unlike), progress=progress
             )
+            normals[unlike], errors[unlike] = taught
         return normals, errors
 
 
 def distil(
-    teacher: ConfidentEstimator,
+    teacher: Estimator,
     light_of: LightOf,
     n_pixels: int,
     size: StudentSize,
@@ -330,8 +326,8 @@ def distil(
     The result is the same for the same seed.
 
     Args:
-        light_of: gives the observations and the light directions of some pixels.
-        n_pixels: of the capture.
+        teacher: has confidence, and is bound to the capture.
+        light_of, n_pixels: see Estimator.bind.
         progress: called with numbers of pixels; in all, twice the pixels of the sample.
 
     Raises:

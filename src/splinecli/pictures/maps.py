@@ -49,7 +49,7 @@ def encode_png(
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
 WHITE_QUANTILE = 0.99  # of the largest channel: this albedo is white in a picture
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # by default white in a picture: mean curvature in 1/pixel, relief in pixels
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0
 
 TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
 
@@ -72,7 +72,7 @@ def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
     return encode_srgb(albedo / white)
 
 
-def confidence_picture(confidence_map: Singles) -> Picture:
+def confidence_picture(confidence_map: Singles, _: Bools | None = None) -> Picture:
     """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
     return np.rint(255 * confidence_map).astype(np.uint8)
 
@@ -86,9 +86,10 @@ def preview_picture(normal_map: Singles, mask: Bools) -> Picture:
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-def signed_picture(values: Singles, scale: float) -> Picture:
-    """Return values (H, W) as a gray picture (H, W): 0 and NaN are gray, -scale is black, scale is white."""
-    share = np.nan_to_num(values / scale).clip(-1, 1)
+def signed_picture(values: Singles, _: Bools, scale: float) -> Picture:
+    """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale black, scale white."""
+    first = values if values.ndim == 2 else values[..., 0]
+    share = np.nan_to_num(first / scale).clip(-1, 1)
     return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)
 
 

@@ -18,10 +18,10 @@ from typing import Any, Literal, NamedTuple
 
 from splinecli import __version__
 from splinecli.capture import capture_name
-from splinecli.capture.files import MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
+from splinecli.output_files import MAPS, NORMALS, REPORT, SCALED_MAPS, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, ClusterOptions, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256, make_method
@@ -221,7 +221,7 @@ def find_earlier(
         if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
             raise ValueError
     except UnfinishedError as error:
-        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        found = next((name for name in own_files() if (target / name).exists()), None)
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):

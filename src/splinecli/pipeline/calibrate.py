@@ -9,11 +9,11 @@ from typing import Any
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.lamps import calibration_report, measure_light_intensities, summary_lines, triangulate_lamps
-from splinecli.capture.files import CALIBRATION
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
+from splinecli.output_files import CALIBRATION
 from splinecli.pictures.maps import calibration_picture, encode_png
 from splinecli.system.files import check_free
 from splinecli.system.progress import SILENT, Observer

@@ -11,8 +11,8 @@ from splinecli.calibration.balls import find_view
 from splinecli.capture.light_files import check_writable, encode_lights
 from splinecli.capture.record import FoundLights
 from splinecli.capture_warnings import estimated_lights
-from splinecli.diagnosis.checks import check_evidence
-from splinecli.diagnosis.evidence import Evidence
+from splinecli.diagnosis.capture_sample import CaptureSample
+from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
@@ -91,7 +91,9 @@ def describe_capture(
         check, warnings = None, summary.warnings()
         if summary.samples is not None:
             indices = range(source.n_lights)
-            check, found = check_evidence(Evidence.of_source(source, summary.samples, indices, strict=reading.strict))
+            check, found = check_sample(
+                CaptureSample.of_source(source, summary.samples, indices, strict=reading.strict)
+            )
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))

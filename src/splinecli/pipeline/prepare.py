@@ -6,8 +6,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.files import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
+from splinecli.output_files import CONTACT_SHEET
 from splinecli.pictures.maps import contact_sheet, encode_png
 from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
 from splinecli.pixel_sets.entries import (

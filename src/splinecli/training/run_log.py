@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.files import CURVES, TRAINING_MAPS
 from splinecli.errors import OutputError
+from splinecli.output_files import CURVES, TRAINING_MAPS
 from splinecli.pictures.plots import observation_map_figure, png_bytes, training_figure
 from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.machine import import_extra

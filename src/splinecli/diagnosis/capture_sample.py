@@ -25,7 +25,7 @@ from splinecli.system.files import equal_files, reading
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class CaptureSample:
     """F images and their lights as the checks see them; what several checks need is found once."""
 
     names: Sequence[str]
@@ -58,7 +58,7 @@ class Evidence:
         *,
         truth: Floats | None = None,
         strict: bool = False,
-    ) -> Evidence:
+    ) -> CaptureSample:
         """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
         (sample, closeup), lamps = samples, source.lamps
         images = [source.files.images[index] for index in indices]
