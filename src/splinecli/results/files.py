@@ -28,7 +28,8 @@ from splinecli.output_files import (
     REPORT,
     own_files,
 )
-from splinecli.pictures.maps import encode_png, error_map_picture
+from splinecli.pictures.maps import encode_png
+from splinecli.pictures.plots import error_map_picture
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
