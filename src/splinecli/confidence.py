@@ -30,14 +30,10 @@ FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
 
 FEWEST_PIXELS = 50
 
-_SAMPLE = 1500  # pixels
-_FACTOR_SAMPLE = 1000
 _BLOCKS = 2500  # over which normals are averaged for their curl
 _DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
 _FITS = 4
-_DECODING = 2.2  # an exponent close to the curve of sRGB
 _MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
-_GRAZING = 0.05  # cosine of the light, below which a prediction is too uncertain
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
@@ -79,9 +75,6 @@ def correct_errors(
     return True
 
 
-_COMMON_SHAPE = 3.5  # of the distribution of an error that all normals share: four of five are within a factor of 1.6
-
-
 def add_common_error(errors: Floats32, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
@@ -91,7 +84,8 @@ def add_common_error(errors: Floats32, error_deg: float) -> None:
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
     share = -np.expm1(own - 2 * errors[:, 0])
-    errors[:, 1] += share * (np.log(_COMMON_SHAPE) - errors[:, 1])
+    # The shape of an error that all normals share: four of five are within a factor of 1.6.
+    errors[:, 1] += share * (np.log(3.5) - errors[:, 1])
 
 
 class CaptureFeatures(NamedTuple):
@@ -163,7 +157,7 @@ def capture_features(
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
         return None
-    rows = np.arange(0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
+    rows = np.arange(0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
     light = light_of(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
@@ -238,7 +232,7 @@ def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles
 def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Doubles) -> Doubles:
     """Return what matte pixels with these normals (p, 3) and any albedo leave of values (p, F)."""
     cosines = (normals @ lights.T).clip(min=0)
-    seen = lit * (cosines > _GRAZING)
+    seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain
     weights = seen
     for _ in range(_FITS):
         albedo = (weights * values * cosines).sum(axis=1) / (weights * cosines**2).sum(axis=1).clip(min=1e-6)
@@ -258,11 +252,11 @@ def _turning(lights: Doubles) -> Doubles:
 
 def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, float]:
     """Return rank_residual, light_misfit, free_light_misfit and decoding; see CaptureFeatures."""
-    few = values[:: max(1, len(values) // max(_FACTOR_SAMPLE, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
+    few = values[:: max(1, len(values) // max(1000, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
     factors = find_factors(few)
     if factors is None:
         return (np.nan,) * 4
-    decoded = find_factors(np.maximum(few, 0) ** _DECODING)
+    decoded = find_factors(np.maximum(few, 0) ** 2.2)  # an exponent close to the curve of sRGB
     misfits = (each.misfits(lights[None])[0] for each in (factors, factors.with_free_intensities()))
     known, free = (float(np.log(misfit + _LEAST_SHARE)) for misfit in misfits)
     rank = float(np.log(factors.residual + _LEAST_SHARE))

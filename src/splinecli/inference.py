@@ -34,9 +34,6 @@ from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
 
-ROUNDS = 2
-"""Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
-
 METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
 
 PIXELS_ON_THE_WAY = 40_000
@@ -52,7 +49,9 @@ def find_surface(capture: Capture) -> Capture:
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
-    for _ in range(ROUNDS):
+    # Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are
+    # enough.
+    for _ in range(2):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = LampLight.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))

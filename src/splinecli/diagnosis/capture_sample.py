@@ -102,8 +102,8 @@ class CaptureSample:
         if self.lamps is None:
             return self.sample.observations
         lamps = self.lamps.choose_lights(self.indices)
-        near, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
-        observations = self.sample.observations / strengths
+        near, attenuation = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
+        observations = self.sample.observations / attenuation
         scaled_normals = solve_each(observations, near)
         return np.asarray(observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals))
 

@@ -21,24 +21,13 @@ from splinecli.maths import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
 from splinecli.restoration.lamps import estimate_light_intensities
 
-SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
-MOST_BACKGROUND = 0.5  # share of near black pixels above which a capture without a mask carries a warning
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 
-SAME_IMAGE = 1e-12
-"""One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
-
-SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
 DECISIVE = 0.35
 """Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
 ones, none leaves so little. Intensities are an exception, since on flat objects they explain any order."""
 
-_SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
-
-SCALES, SCALE_TOLERANCE = (4, 6, 8), 0.2
-"""The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the brightness of an
-image may differ from them."""
 
 _FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
 _MOST_NAMED = 4  # shifted images in a sentence
@@ -68,8 +57,10 @@ def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
             continue
         factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
         stops = abs(np.log2(max(factor, 1e-6)))
-        bits = min(SCALES, key=lambda bits: abs(bits - stops))
-        if abs(bits - stops) > SCALE_TOLERANCE:
+        # The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the
+        # brightness of an image may differ from them.
+        bits = min((4, 6, 8), key=lambda bits: abs(bits - stops))
+        if abs(bits - stops) > 0.2:
             continue
         mended = seen.observations.copy()
         mended[:, place] /= factor
@@ -109,7 +100,7 @@ def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
 
 
 def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
-    if seen.background > MOST_BACKGROUND:
+    if seen.background > 0.5:  # the share of near black pixels
         text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
         text += " background mean nothing. Add --auto-mask, or give a mask."
         yield CaptureWarning(codes.NO_MASK, text)
@@ -117,7 +108,7 @@ def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
 
 def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread < SMALLEST_SPREAD:
+    if spread < 0.1:  # lights that determine normals worse; see light_spread
         where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
         times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
         text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
@@ -128,7 +119,8 @@ def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
     pairs = sorted({*repeated_images(seen.sample.observations), *seen.copies})
     differ = "" if seen.found else ", but their lights differ"
     if differ:
-        pairs = [pair for pair in pairs if angle_between_deg(*seen.directions[list(pair)]) > SAME_LIGHT_DEG]
+        # Images under lights closer than this may be the same.
+        pairs = [pair for pair in pairs if angle_between_deg(*seen.directions[list(pair)]) > 0.01]
     if pairs:
         first, second = (seen.names[place] for place in pairs[0])
         others = len(pairs) - 1
@@ -218,7 +210,8 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     }
     errors = {words: float(np.std(needed - way)) for words, way in ways.items()}
     words = min(errors, key=lambda each: errors[each])
-    how = f", for example {words}" if errors[words] < _SAME_INTENSITIES * np.std(np.log(reading.intensities)) else ""
+    # A simple reading of the file leaves at most this share of the spread.
+    how = f", for example {words}" if errors[words] < 0.4 * np.std(np.log(reading.intensities)) else ""
     return (
         f"The light intensities that are given do not fit the images: with other ones{how}, {left}. Check that their"
         " file is in the order of the images, or leave them out with --intensities equal."
@@ -334,7 +327,8 @@ def repeated_images(observations: Floats) -> list[tuple[int, int]]:
     values = observations.astype(np.float64)
     values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)
     varied = np.ptp(values, axis=0) > 0
-    same = (1 - values.T @ values < SAME_IMAGE) & varied & varied[:, None]
+    # One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more.
+    same = (1 - values.T @ values < 1e-12) & varied & varied[:, None]
     return [(int(first), int(second)) for first, second in np.argwhere(np.triu(same, 1))]
 
 

@@ -33,18 +33,11 @@ CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
 TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
-NEAR = 0.1  # candidates whose advantages differ by less are near equals
 LOWEST_CURL = 0.1  # Curls below this are noise. On a cap of a sphere, other frames give little more.
 
-LEAST_ROTATION_DEG = 10  # from any frame; smaller rotations are errors of a calibration
 ROTATED = 2.0
 """Smallest advantage of lights rotated about the view axis by any angle: it is fitted, so it wins a little by noise."""
 
-OPEN_ERROR_DEG = 10.0
-"""Error stated where a bump cannot be told from a hollow although shadows of the given lights are missing: with it,
-about a quarter of the normals of a good capture are expected within 5 degrees."""
-
-_RANDOM_ORDERS = 3  # of the lights, under which the normals of an unknown order are compared with the given ones
 
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
@@ -184,7 +177,8 @@ def _check_frame_and_order(
     lights = light_directions[chosen]
     if order == UNKNOWN_ORDER:
         rng = np.random.default_rng(0)
-        orders = [rng.permutation(lights) for _ in range(_RANDOM_ORDERS)]
+        # Normals under these random orders are compared with those under the given one.
+        orders = [rng.permutation(lights) for _ in range(3)]
         turn_deg = float(np.median([median_turn_deg(observations, lights, others) for others in orders]))
     elif mended is not None:
         turn_deg = median_turn_deg(observations, lights, mended)
@@ -206,7 +200,8 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Doubles]]:
     """Yield rotations of the lights about the view axis after which the normals have the least curl, in words."""
     for mirrored in (False, True):
         least_deg = normals.least_curl_deg(mirrored=mirrored)
-        if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < LEAST_ROTATION_DEG:
+        # Smaller rotations from the nearest frame are errors of a calibration.
+        if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < 10:
             continue
         for degrees in (least_deg, least_deg - np.copysign(180, least_deg)):
             cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -254,7 +249,8 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
         better = [candidate for candidate in better if candidate not in simple] or better
     else:
         better = simple
-    near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]
+    # Candidates whose advantages differ by less are near equals.
+    near = [candidate for candidate in better if candidate.advantage > better[0].advantage - 0.1]
     preferred = [candidate for candidate in near if candidate.is_order == in_order]
     return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
 
@@ -308,7 +304,9 @@ def light_warnings(
             " decide which is right. Compare bumps and hollows with the object. If they are exchanged, run again with"
             f" --light-frame {BOTH_NEGATED.after(frame)}."
         )
-        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, OPEN_ERROR_DEG))
+        # A bump cannot be told from a hollow. With this error, about a quarter of the normals of a good capture are
+        # expected within 5 degrees.
+        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
     if strict and check.unchecked:
         text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))

@@ -30,18 +30,10 @@ from splinecli.maths.normals import angle_between_deg
 MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
 MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness
 
-ODD_MISFIT, OTHER_MISFIT = 0.35, 0.75
-"""Largest misfit without the odd image, and smallest one without any other, as shares of that of all images."""
-
-MIN_RESIDUAL, RESIDUAL_RATIO = 0.25, 2.5
-"""An odd image's residual is above the first, as a share of its brightness, and this many times that of any other."""
 
 MAX_RESIDUAL, MAX_OTHER_RESIDUAL = 0.2, 0.15
 """Where the factors leave more of all images, as on metals, misfits tell nothing; the second is for residuals, of the
 other images."""
-
-OTHER_BRIGHTNESS = 0.3
-"""Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +54,17 @@ def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | No
     for compared in (*kinds, factors.with_free_intensities()):
         shares = _shares_left(compared, light_directions)
         first, second = np.argsort(shares)[:2]
-        alone = shares[first] < ODD_MISFIT and shares[second] > OTHER_MISFIT
+        # Largest misfit without the odd image, and smallest one without any other, as shares of that of all images.
+        alone = shares[first] < 0.35 and shares[second] > 0.75
         if alone and factors.residual < MAX_RESIDUAL:
             brightness = _brightness(compared, light_directions, int(first))
             return OddImage(int(first), float(shares[first]), brightness)
     residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
     second, first = np.argsort(residuals)[-2:]
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
-    stands_out = residuals[first] > max(MIN_RESIDUAL, RESIDUAL_RATIO * residuals[second])
+    # An odd image's residual is above the first, as a share of its brightness, and this many times that of any
+    # other.
+    stands_out = residuals[first] > max(0.25, 2.5 * residuals[second])
     if stands_out and left < MAX_OTHER_RESIDUAL:
         return OddImage(int(first), left / factors.residual)
     return None
@@ -97,22 +92,17 @@ def _brightness(factors: Factors, light_directions: Doubles, place: int) -> floa
     predicted, found = light_directions[place] @ fit, factors.matrix[:, place]
     brightness = float(found @ predicted / max(predicted @ predicted, 1e-12))
     misfit = np.linalg.norm(found - brightness * predicted) / max(float(np.linalg.norm(found)), 1e-12)
-    return brightness if brightness > 0 and misfit < OTHER_BRIGHTNESS else None
+    # Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image.
+    return brightness if brightness > 0 and misfit < 0.3 else None
 
 
 LARGEST = 8  # largest shift that is looked for, in pixels of the sample
 
-LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
-"""A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
-images and more, a polished metal reached 0.44 and 0.17."""
 
-LEAST_SHIFT = 0.8  # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
 LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
 LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
 _MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
-_DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
 _LIMIT = 4.0  # of detail, in local contrasts: highlights count no more
-_FAINT = 0.05  # share of the mean contrast below which detail fades out
 
 
 class ImageShift(NamedTuple):
@@ -152,9 +142,9 @@ def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles
     products = values.T @ values
     for place in range(len(products)):
         others = [other for other in predictors if other != place]  # no image predicts itself
-        strengths, directions = np.linalg.eigh(products[np.ix_(others, others)])
+        eigenvalues, directions = np.linalg.eigh(products[np.ix_(others, others)])
         weights = np.zeros((len(products), 3), np.float32)
-        weights[others] = directions[:, -3:] / np.sqrt(np.maximum(strengths[-3:], 1e-12))
+        weights[others] = directions[:, -3:] / np.sqrt(np.maximum(eigenvalues[-3:], 1e-12))
         factors = values @ weights
         yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
 
@@ -166,10 +156,13 @@ def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> t
     right, down = _peak(correlations)
     peak, unmoved = correlations[LARGEST + down, LARGEST + right], correlations[LARGEST, LARGEST]
     at_edge = max(abs(right), abs(down)) == LARGEST  # the peak may lie beyond
-    if at_edge or peak < LEAST_CORRELATION or peak - unmoved < LEAST_GAIN:
+    # A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of
+    # ten images and more, a polished metal reached 0.44 and 0.17.
+    if at_edge or peak < 0.2 or peak - unmoved < 0.2:
         return None
     around = correlations[LARGEST + down - 1 :, LARGEST + right - 1 :][:3, :3]
-    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < LEAST_SHIFT:
+    # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
+    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
         return None
     # A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
     for half in _halves(inner):
@@ -218,9 +211,11 @@ def _detail(values: Singles, mask: Bools) -> Singles:
 
     image = np.zeros(mask.shape, np.float32)
     image[mask] = values
-    detail = (image - blur(image, _DETAIL)) * inside
-    contrast = blur(np.abs(detail), _CONTRAST)
-    detail /= contrast + _FAINT * np.abs(detail[mask]).mean() + np.float32(1e-12)
+    # Finer detail, and local contrast
+    detail = (image - blur(image, 1.5)) * inside
+    contrast = blur(np.abs(detail), 4.0)
+    # Detail fades out below this share of the mean contrast.
+    detail /= contrast + 0.05 * np.abs(detail[mask]).mean() + np.float32(1e-12)
     return np.asarray(detail.clip(-_LIMIT, _LIMIT), np.float32)
 
 

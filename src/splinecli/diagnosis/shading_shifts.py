@@ -27,9 +27,6 @@ OF_MANY, REACH_OF_MANY = (0.02, 0.6), 0.1
 """The same two for half of the images, against the other half, and the largest shift of it, as a share of the smaller
 side. On a photographed glossy ball, five of ten images fitted better when they were moved by a sixth of its width."""
 
-OUTSTANDING = 2.0
-"""The residual of a shifted image is so many times that of the better images, of which a quarter have less. Where the
-model fits no image well, as on polished balls, it does not say which is shifted."""
 
 LEAST_IMAGES, MANY_IMAGES = 8, 10
 LEAST_PIXELS = 300
@@ -37,8 +34,6 @@ LEAST_PIXELS = 300
 MOST_RESIDUAL = 0.6  # of the brightness; the model says nothing of metals, which leave more
 _LEAST_KEPT, _LEAST_OVERLAP = 0.3, 0.5
 _DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and what is added to it
-_WILD = 4.0  # length of scaled normals where a bright value is 1: these are extrapolated from few lit images
-_MOST_VALUES = 200_000  # of pixels and images; beyond, rows and columns are left out
 _PASSES, _FITS = 2, 5
 
 Shift = tuple[int, int]  # right, down
@@ -48,7 +43,8 @@ _NO_SHIFT = 0.0, (0, 0)
 
 def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift]:
     """Return the shifts in pixels of the sample of images that are shifted, by place, under lights (F, 3)."""
-    stride = int(np.ceil(np.sqrt(sample.observations.size / _MOST_VALUES)))
+    # Rows and columns of larger captures are left out.
+    stride = int(np.ceil(np.sqrt(sample.observations.size / 200_000)))
     mask = sample.mask[::stride, ::stride]
     if len(light_directions) < LEAST_IMAGES or np.count_nonzero(mask) < LEAST_PIXELS:
         return {}
@@ -135,7 +131,8 @@ class _MatteModel:
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
         amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
         normals = self._normals - turn * amount[:, None]
-        return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < _WILD, normals, 0.0)
+        # Where a bright value is 1, longer scaled normals are extrapolated from few lit images.
+        return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 4.0, normals, 0.0)
 
     def _compared(self, place: int) -> _Compared | None:
         """Return how the model fits an image at all shifts; None if it says nothing of this image.
@@ -234,7 +231,9 @@ def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float,
     around = np.abs(np.arange(-reach, reach + 1))
     near = np.maximum(around[:, None], around) <= COUNTED * reach
     with np.errstate(invalid="ignore"):
-        counts = near & (unmoved - left >= least_fall) & (unmoved <= MOST_RESIDUAL) & (unmoved >= OUTSTANDING * usual)
+        # The residual of a shifted image is so many times that of the better images, of which a quarter have less.
+        # Where the model fits no image well, as on polished balls, it does not say which is shifted.
+        counts = near & (unmoved - left >= least_fall) & (unmoved <= MOST_RESIDUAL) & (unmoved >= 2.0 * usual)
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]
     row, column = np.unravel_index(int(shares.argmin()), shares.shape)

@@ -39,7 +39,6 @@ _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
 _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
-_NEAREST_TICKS = 0.045  # share of the axis: labels that are closer would overlap
 
 
 def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
@@ -154,7 +153,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     span = max(place.values()) - min(place.values())
     labels, last = [], -math.inf
     for x, position in place.items():
-        fits = position - last > _NEAREST_TICKS * span
+        fits = position - last > 0.045 * span  # share of the axis: labels that are closer would overlap
         labels.append(ticks[x] if fits else "")
         last = position if fits else last
     axes.set_xticks(list(place), labels)
@@ -165,7 +164,6 @@ SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
 
 MAPS = "_observation_maps"
-MOST_LISTED = 16  # largest number of lights that a title lists
 
 
 class CaptureFigure(NamedTuple):
@@ -213,7 +211,8 @@ def capture_figures(
         )
         assert estimate.error_map_deg is not None
         normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
-    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= MOST_LISTED else ""
+    # A title lists at most so many lights.
+    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]

@@ -30,8 +30,6 @@ from splinecli.system.files import as_splinecli_error, parse_json, refusals_as_o
 from splinecli.system.progress import Progress
 from splinecli.system.publishing import is_plain
 
-_LONGEST_LINE = 1 << 16  # characters
-
 
 @dataclass(frozen=True)
 class Trial:
@@ -106,7 +104,7 @@ class TrialStore:
             kept = []
             if is_plain(path) and not fresh:
                 with path.open(encoding="utf-8", errors="replace") as file:
-                    while line := file.readline(_LONGEST_LINE):  # a longer one in parts
+                    while line := file.readline(1 << 16):  # a longer one in parts
                         if (read := _read_line(line)) is not None:
                             kept.append(line.rstrip("\n") + "\n")
                             self._scores.update((read,))

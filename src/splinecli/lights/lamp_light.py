@@ -51,12 +51,12 @@ class LampLight:
     def of(cls, observations: NDArray[np.float32], lamps: NearLamps) -> LampLight:
         """Return the light on the points of `lamps`, from observations (P, F)."""
         assert lamps.points is not None
-        directions, strengths = lamps.light_at(lamps.points)
+        directions, attenuation = lamps.light_at(lamps.points)
         turns = None
         if lamps.camera_matrix is not None:
             turns = _turns_to_view(unit(_camera_position(lamps) - lamps.points)).astype(np.float32)
             directions = np.einsum("pij,pfj->pfi", turns, directions)
-        return cls(observations / strengths, directions, turns)
+        return cls(observations / attenuation, directions, turns)
 
     @classmethod
     def distant(cls, observations: NDArray[np.float32], directions: Floats, rays: Floats) -> LampLight:

@@ -209,11 +209,7 @@ class Perceptron(nn.Module):
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 
-_HELD_OUT = 1 / 8  # of the sample
 _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
-_RARE_SHARE = 0.01  # of the pixels, and
-_RARE_PER_SAMPLE = 2  # times the sample are the most pixels of rare kinds that go through the network
-_LARGEST_SHARE = 0.7  # of the expected error; on rendered pixels, more cost 0.3 degrees and more against the truth
 
 
 @dataclass(frozen=True)
@@ -229,7 +225,8 @@ class Distillation:
     @property
     def is_good(self) -> bool:
         """Whether the perceptron follows the network as closely as the network's own errors deserve."""
-        return self.mean_deg <= _LARGEST_SHARE * self.expected_deg
+        # On rendered pixels, more cost 0.3 degrees and more against the truth.
+        return self.mean_deg <= 0.7 * self.expected_deg
 
 
 class DistilledEstimator(Estimator):
@@ -344,13 +341,14 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False), torch.enable_grad():
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / n_pixels)
+        # At most 1 % of the pixels, and twice the sample, are of rare kinds and go through the network.
+        rare_share = min(0.01, 2 * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         rows = sample.rows.numpy()
         taught = teacher.estimate_with_error(candidates[rows], directions_at(directions, rows), progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
         normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
-        held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all
+        held = round(len(inputs) / 8)  # the first pixels are an even sample of all
         share = len(inputs) / size.steps
         done = 0.0
 

@@ -46,7 +46,6 @@ def encode_png(
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-WHITE_QUANTILE = 0.99  # of the largest channel: this albedo is white in a picture
 CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0
 
 TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
@@ -60,7 +59,8 @@ def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
     """
-    white = max(float(np.quantile(albedo[mask].max(axis=1), WHITE_QUANTILE)), 1e-12)
+    # The brightest 1 % are white.
+    white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
 
 
@@ -103,8 +103,6 @@ def bounding_box(mask: Bools) -> tuple[slice, slice]:
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-SCENE_TILE = 96  # pixels: large enough to recognise shapes and materials; sixty scenes fit on a screen or two
-LARGE_TILE, FEW_SCENES = 160, 12
 MOST_SCENES = 120
 _LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
 
@@ -115,7 +113,8 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
     for entry in pixel_set.entries:
         scenes.setdefault(entry.scene, []).append(entry)
     every = -(-len(scenes) // MOST_SCENES)
-    tile = LARGE_TILE if len(scenes) <= FEW_SCENES else SCENE_TILE
+    # Large enough to recognise shapes and materials; sixty scenes fit on a screen or two.
+    tile = 160 if len(scenes) <= 12 else 96
     with np.errstate(all="ignore"):  # a damaged array may have NaN
         strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
     width = max(strip.shape[1] for strip in strips)

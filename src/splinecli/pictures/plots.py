@@ -97,7 +97,6 @@ def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
 
 
 _MAP_INCHES = 1.7
-_EMPTY = "0.85"  # light gray, which the colour scale does not contain
 _SMALL, _LARGE = 8, 9  # points
 
 
@@ -155,7 +154,7 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
 
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_facecolor(_EMPTY)
+    axes.set_facecolor("0.85")  # light gray, which the colour scale does not contain
     # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
     # stand for a single line each.
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
@@ -163,8 +162,6 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
         centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
     axes.add_patch(Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False))
 
-
-_LARGEST_LINEAR_RATIO = 20  # An axis whose values span more is logarithmic.
 
 Columns = Mapping[str, Sequence[float | None]]
 
@@ -209,16 +206,11 @@ def _finish_curves(axes: Axes) -> None:
     axes.grid(alpha=0.3)
     axes.legend()
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-    if (values > 0).all() and values.max() > _LARGEST_LINEAR_RATIO * values.min():
+    if (values > 0).all() and values.max() > 20 * values.min():  # An axis whose values span more is logarithmic.
         axes.set_yscale("log")
 
 
 _MOST_WIDE = 3600  # pixels, all columns without gaps: the picture stays below 4000
-_MOST_HIGH = 1200  # pixels: one map
-_ENLARGED = 240  # pixels: small maps are enlarged while their longer side stays within it
-_SMALLEST_CELL = 150  # pixels: room for the colour bar and a name
-_LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
-_TEXT_WIDTH = 0.62  # of its height: the average width of a character
 _MAPS_DPI = 100
 _POINT = _MAPS_DPI / 72  # pixels
 
@@ -251,7 +243,7 @@ def method_maps(
     errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
-    cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
+    cell_height, cell_width = (max(side, 150) for side in truth.shape[:2])  # pixels: room for the colour bar and a name
     text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
     gap, line = text // 2, 2 * text
     errors_at = gap + line  # from the bottom, as in matplotlib
@@ -359,16 +351,17 @@ def _write(
     figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
 
 
-def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
+def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
     """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
     longest = max(18, *(len(line) for line in lines))
-    return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
+    return min(most, max(10, int(width / (0.62 * longest))))  # characters are 0.62 of their height wide
 
 
 def _scale(height: int, width: int, columns: int) -> float:
     """Return the factor of enlargement: a whole number, or less than 1."""
-    most = min(_MOST_WIDE / columns / width, _MOST_HIGH / height)
-    return most if most < 1 else max(1, min(int(most), _ENLARGED // max(height, width)))
+    most = min(_MOST_WIDE / columns / width, 1200 / height)  # a map has at most 1200 rows
+    # Small maps are enlarged while their longer side stays within 240 pixels.
+    return most if most < 1 else max(1, min(int(most), 240 // max(height, width)))
 
 
 def _resize(picture: Picture, scale: float) -> Picture:

@@ -250,9 +250,6 @@ def find_earlier(
     return report
 
 
-_ASKED = 16  # captures that stand for a batch
-
-
 def infer_batch(
     folders: Sequence[Path],
     options: InferOptions,
@@ -396,6 +393,6 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
     """
     if choose_device(options.device).type == "cuda":
         return 1
-    asked = members[:: max(1, len(members) // _ASKED)]
+    asked = members[:: max(1, len(members) // 16)]  # captures that stand for a batch
     each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
     return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

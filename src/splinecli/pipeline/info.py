@@ -26,10 +26,7 @@ from splinecli.system.progress import SILENT, Observer
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net
-LEARNED_PER_SECOND = 1000  # of the sample of a distilled network, in the network and in learning
 DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
-SURFACE_PER_SECOND = 50_000  # integration, mesh and their files, on one core
-STARTING_SECONDS = 3
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -205,7 +202,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
-    first, seconds = summary.images[0], STARTING_SECONDS + _seconds(summary)
+    first, seconds = summary.images[0], 3 + _seconds(summary)
     view = find_view(source.facts[0], None)
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
@@ -247,7 +244,8 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "expect": {
             "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
-            "seconds_with_surface": round(seconds + summary.n_pixels / SURFACE_PER_SECOND),
+            # 50,000 pixels a second: integration, mesh and their files on one core
+            "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
 
@@ -257,4 +255,5 @@ def _seconds(summary: CaptureSummary) -> float:
     count = summary.n_pixels
     if count < AUTOMATIC_FROM:
         return count / PIXELS_PER_SECOND
-    return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
+    # The network sees and learns 1000 pixels of the sample a second.
+    return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND

@@ -93,9 +93,6 @@ def relief(_: CaptureSource, estimate: NormalEstimate, __: Progress) -> NDArray[
     return relief_of_normals(estimate.normal_map, estimate.capture.mask)
 
 
-LIT = 0.15  # a light counts for a pixel if n.l is above this
-AGREEING = 0.3  # an observation counts within this share of the median albedo: no highlights, no cast shadows
-RESTORED_WEIGHT = 1e-3  # of a restored observation, whose colour is saturated: the others decide
 _TILE_PIXELS = 65_536
 
 
@@ -119,21 +116,22 @@ def albedo_map(
     counts = np.empty(capture.observations.shape, np.bool_)
     for start in range(0, len(normals), _TILE_PIXELS):
         tile = slice(start, start + _TILE_PIXELS)
-        cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
-        counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
+        cosines, attenuation = _shading(capture, normals, tile, range(capture.n_lights))
+        counts[tile] = _agreeing(capture.observations[tile] / attenuation, cosines)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
     images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
     for position, colours in enumerate(images):
-        cosines, strengths = _shading(capture, normals, slice(None), [position])
+        cosines, attenuation = _shading(capture, normals, slice(None), [position])
         cosine = cosines[:, 0] * counts[:, position]
-        colours /= strengths
+        colours /= attenuation
         if capture.estimated_colours is not None:
             colours /= capture.estimated_colours[position].astype(np.float32)
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
         if capture.restored is not None:
-            weight = cosine * np.where(capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1))
+            # The colour of a restored observation is saturated, so the others decide.
+            weight = cosine * np.where(capture.restored[:, position], np.float32(1e-3), np.float32(1))
         colours *= weight[:, None]  # in place, because large captures need the memory
         total += colours
         squares += weight * cosine
@@ -144,24 +142,25 @@ def albedo_map(
 
 
 def _shading(
-    capture: Capture, normals: NDArray[np.float32], rows: slice, positions: Sequence[int]
+    capture: Capture, normals: NDArray[np.float32], pixels: slice, positions: Sequence[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) of some pixels under K lights, and the strengths of these: (p, K), or (1, 1) if distant."""
+    """Return n.l (p, K) of some pixels under K lights, and the attenuation of their light: (p, K), or (1, 1) if distant."""
     if capture.lamps is None:
         lights = capture.light_directions[list(positions)].astype(np.float32)
-        return normals[rows] @ lights.T, np.ones((1, 1), np.float32)
+        return normals[pixels] @ lights.T, np.ones((1, 1), np.float32)
     assert capture.lamps.points is not None
-    directions, strengths = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[rows])
-    return np.einsum("pfc,pc->pf", directions, normals[rows]), strengths
+    directions, attenuation = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[pixels])
+    return np.einsum("pfc,pc->pf", directions, normals[pixels]), attenuation
 
 
 def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
-    lit = cosine > LIT
+    lit = cosine > 0.15  # others graze
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
     # The median of the lit observations, which sorting moves to the front.
     ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
     middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
     with np.errstate(invalid="ignore"):
-        close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= AGREEING * middle)
+        # Others are highlights or in cast shadow.
+        close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= 0.3 * middle)
     return close

@@ -210,9 +210,7 @@ def _data_url(picture: Picture) -> str:
 INDEX = "index.html"
 
 THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
-_LARGEST_SHOWN = 10**9  # bytes of a normal map shown small: 33 megapixels of 16 bits; others may be bombs
 _OURS = b'<meta name="generator" content="splinecli">'
-_START = 1 << 16  # bytes of a page, which contain this mark
 
 
 class Row(NamedTuple):
@@ -281,7 +279,8 @@ def _thumbnail(path: Path) -> str | None:
     import cv2
 
     try:
-        if image_bytes(*read_facts(path).size) > _LARGEST_SHOWN:
+        # 33 megapixels of 16 bits; larger ones may be bombs.
+        if image_bytes(*read_facts(path).size) > 10**9:
             return None
         picture = decode_image(path)
     except InputError:
@@ -320,7 +319,7 @@ def has_index(folder: Path) -> bool:
         if not (folder / INDEX).is_file():
             return False
         with (folder / INDEX).open("rb") as file:
-            return _OURS in file.read(_START)
+            return _OURS in file.read(1 << 16)  # the mark is near the top
     except OSError:
         return False
 

@@ -62,9 +62,6 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
 
 
-_CLOSEST = 2.2  # largest factor by which a view is enlarged
-
-
 def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> Mesh:
     """Draw a view of a mesh, which is in the frame.
 
@@ -77,7 +74,8 @@ def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> M
         mesh = _touching(mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng)
     mesh = fit_to_frame(mesh)
     if rng.random() < 0.5:
-        enlarged, middle = rng.uniform(1, _CLOSEST), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
+        # A view is enlarged by up to this factor.
+        enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
         shift = np.append(middle * (1 - enlarged), 0)
         mesh = Mesh((mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals)
     return split_long_edges(mesh, longest=LONGEST_EDGE)

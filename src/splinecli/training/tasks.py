@@ -133,7 +133,6 @@ def _split_sets(sets: dict[str, PixelSet], share: float) -> dict[str, tuple[list
 
 
 VALIDATION_PIXELS = 2048
-_VALIDATION_DRAW = 64  # pixels at a time, if not a whole capture: a draw has one source
 VALIDATION_SCENES = 12
 SHOWN_PIXELS = 8
 
@@ -170,7 +169,8 @@ class PixelTask:
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         if rank == 0:
-            pixels = min(max(_VALIDATION_DRAW, self.config.pixels.capture_pixels), VALIDATION_PIXELS)
+            # At least 64 pixels at a time, because a draw has one source
+            pixels = min(max(64, self.config.pixels.capture_pixels), VALIDATION_PIXELS)
             self.validation = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
 
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
