@@ -144,7 +144,7 @@ def albedo_map(
 def _shading(
     capture: Capture, normals: NDArray[np.float32], pixels: slice, positions: Sequence[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) of some pixels under K lights, and the attenuation of their light: (p, K), or (1, 1) if distant."""
+    """Return n.l (p, K) of some pixels under K lights, and the lights' attenuation (p, K), (1, 1) if distant."""
     if capture.lamps is None:
         lights = capture.light_directions[list(positions)].astype(np.float32)
         return normals[pixels] @ lights.T, np.ones((1, 1), np.float32)
