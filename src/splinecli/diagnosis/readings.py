@@ -42,13 +42,27 @@ EIGHT_BIT = 0.8  # taken off the cost of a curve where images of 8 bits do not s
 LIKELY = 0.5  # probability from which a reading is named
 
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
-_MIN_LIGHTS, _LIGHTS_FOR_MEDIAN = 4, 8
-_MAX_PIXELS, _MAX_OBSERVATIONS, _MIN_PIXELS = 400, 16_000, 60
-_DARK_SHARE = 0.1  # of the brightest hundredth of the pixels; darker ones are background
-_SHADOW = 0.1  # share of a pixel's largest value; smaller values are shadow
-_FITS, _FREE_FITS, _OFFSET_FITS = 8, 30, 14
-_STEP = 1.5  # exponent of each change of intensities, which saves a third of the fits
-_LEAST = 1e-4  # added to residuals; 16 bits do not go below it
+
+
+@dataclass(frozen=True)
+class FitLimits:
+    """How readings are fitted; see Readings."""
+
+    min_lights: int = 4
+    for_median: int = 8  # from here on, the median residual is typical, else the mean
+    max_pixels: int = 400
+    max_observations: int = 16_000
+    min_pixels: int = 60
+    dark: float = 0.1  # of the brightest hundredth of the pixels; darker ones are background
+    shadow: float = 0.1  # of a pixel's largest value; smaller values are shadow
+    fits: int = 8
+    free_fits: int = 30  # with free intensities
+    offset_fits: int = 14  # with constant light
+    step: float = 1.5  # the exponent of each change of intensities, which saves a third of the fits
+    least: float = 1e-4  # added to residuals; 16 bits do not go below it
+
+
+FIT = FitLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +106,9 @@ class Readings:
         self, sample: Sample, lights: Doubles, intensities: Doubles | None = None, *, eight_bit: bool = False
     ) -> None:
         n_lights = len(lights)
-        chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+        chosen, values = lit_values(
+            sample.observations, FIT.dark, min(FIT.max_pixels, FIT.max_observations // n_lights)
+        )
         # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
         clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
         # Values at full scale look like a curve. As shadows, they do not count.
@@ -100,12 +116,12 @@ class Readings:
             values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
-        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
+        enough = (values > FIT.shadow).sum(axis=1) >= min(5, n_lights)
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
         self.shape, self.eight_bit = sample.mask.shape, eight_bit
-        self.are_enough = n_lights >= _MIN_LIGHTS and len(self.values) >= _MIN_PIXELS
+        self.are_enough = n_lights >= FIT.min_lights and len(self.values) >= FIT.min_pixels
 
     def fit(self, kinds: Collection[Kind]) -> list[Reading]:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
@@ -209,7 +225,7 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     """
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
-    ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
+    ratio = (found.residual + FIT.least) / (given.residual + FIT.least)
     power = POWERS[kind]
     if len(given.intensities) < _LEAST_LIGHTS["curve"]:
         power *= 0.6  # four or five lights
@@ -236,7 +252,7 @@ def _fit(
     *,
     offset: float = 0.0,
     free: bool = False,
-    shadow: float = _SHADOW,
+    shadow: float = FIT.shadow,
 ) -> _Fit:
     """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
 
@@ -251,7 +267,7 @@ def _fit(
         # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
         above = np.maximum(observed - offset / (offset + 0.8), 0)
         normals = fit_scaled_normals(above, start, lights)
-    for _ in range(_OFFSET_FITS if offset else _FREE_FITS if free else _FITS):
+    for _ in range(FIT.offset_fits if offset else FIT.free_fits if free else FIT.fits):
         if offset:
             facing = (shade(normals, lights) > 0)[..., None]
             # Newton's step on |b|, halved: with much constant light, whole steps miss.
@@ -266,7 +282,7 @@ def _fit(
             intensities = _intensities(observed, predicted / intensities, weights, intensities)
     residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
     # The fits to few lights pass through most values. The median would be zero.
-    typical = np.median(residuals) if values.shape[1] >= _LIGHTS_FOR_MEDIAN else residuals.mean()
+    typical = np.median(residuals) if values.shape[1] >= FIT.for_median else residuals.mean()
     return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
 
 
@@ -276,7 +292,7 @@ def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Do
     power = (weights * equal**2).sum(axis=0)
     found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
     found = np.clip(found / found.mean(), 0.05, 20)
-    intensities = before * (found / before) ** _STEP
+    intensities = before * (found / before) ** FIT.step
     return np.asarray(intensities / intensities.mean())
 
 
