@@ -211,17 +211,17 @@ def estimate_pixels(
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
-    def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
-        found, of_rows = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
+    def estimate(pixels: Rows, light: LampLight, progress: Progress | None = None) -> None:
+        found, of_pixels = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
         if errors is not None:
-            errors[rows] = of_rows
-        normals[rows] = light.in_frame_of_capture(found)
+            errors[pixels] = of_pixels
+        normals[pixels] = light.in_frame_of_capture(found)
 
     light_of = partial(light_without, None)
     refiner = estimator.refiner
     estimator = estimator.bind(light_of, n_pixels)
-    for rows in parts_of_rows(n_pixels, tile_pixels):
-        estimate(rows, light_of(rows), progress)
+    for pixels in parts_of_rows(n_pixels, tile_pixels):
+        estimate(pixels, light_of(pixels), progress)
     if refiner is None or errors is None:
         return PixelEstimates(normals, errors, light_of)
     with (stage or _no_stage)("removing indirect light") as advance:
@@ -230,11 +230,11 @@ def estimate_pixels(
             light_of = partial(light_without, indirect)
             # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
             estimator = estimator.rebind(light_of, n_pixels)
-            for rows in parts_of_rows(n_pixels, tile_pixels):
-                changed = rows[indirect.counts_at(observations[rows], rows)]
+            for pixels in parts_of_rows(n_pixels, tile_pixels):
+                changed = pixels[indirect.counts_at(observations[pixels], pixels)]
                 if len(changed):
                     estimate(changed, light_of(changed))
-                advance(len(rows))
+                advance(len(pixels))
     return PixelEstimates(normals, errors, light_of)
 
 
@@ -245,17 +245,17 @@ def _no_stage(_: str) -> AbstractContextManager[Progress]:
 def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
     """Return what gives the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
     lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
-    pixels = PixelPlaces(capture.mask)
+    places = PixelPlaces(capture.mask)
 
-    def light_without(indirect: IndirectLight | None, rows: Rows) -> LampLight:
-        observations = capture.observations[rows]
+    def light_without(indirect: IndirectLight | None, pixels: Rows) -> LampLight:
+        observations = capture.observations[pixels]
         if indirect is not None:
-            observations = indirect.remove(observations, rows)
+            observations = indirect.remove(observations, pixels)
         if lamps is not None:
-            return LampLight.of(observations, lamps.choose_pixels(rows))
+            return LampLight.of(observations, lamps.choose_pixels(pixels))
         if camera_matrix is None:
             return LampLight(observations, directions)
-        return LampLight.distant(observations, directions, rays_at(*pixels.places(rows), camera_matrix))
+        return LampLight.distant(observations, directions, rays_at(*places.places(pixels), camera_matrix))
 
     return light_without
 

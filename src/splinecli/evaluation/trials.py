@@ -164,7 +164,7 @@ class TrialSource:
 
         It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
         """
-        protocol, rows = trial.protocol, None if whole else self.rows
+        protocol, pixels = trial.protocol, None if whole else self.rows
         seen = self.stored.choose_lights(self.places(trial.lights))
         if protocol.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
@@ -173,16 +173,16 @@ class TrialSource:
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if protocol.as_stored else seen.estimate_intensities()
         needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
-        if rows is not None and not needs_all:
-            seen, rows = seen.choose_pixels(rows), None
+        if pixels is not None and not needs_all:
+            seen, pixels = seen.choose_pixels(pixels), None
         capture = seen.capture if protocol.as_stored else seen.restore(intensities)
         if protocol.light_error_deg is not None:
             known = self.stored.intensities_known
             capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
-        if rows is None:
+        if pixels is None:
             return capture
         # Near lamps need the surface, which only all pixels together have.
-        return find_surface(capture).choose_pixels(rows)
+        return find_surface(capture).choose_pixels(pixels)
 
     def places(self, lights: Sequence[int]) -> list[int]:
         """Return the places of lights among those that were read."""
@@ -272,14 +272,14 @@ class CaptureReading:
         except OSError as error:
             raise as_splinecli_error(error, self.folder) from error
         first = self.protocols[0]
-        rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
-        if len(rows) == stored.capture.n_pixels:
+        pixels = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
+        if len(pixels) == stored.capture.n_pixels:
             trials = TrialSource(stored)
         elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
             # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
-            trials = TrialSource(stored, rows)
+            trials = TrialSource(stored, pixels)
         else:
-            trials = TrialSource(stored.choose_pixels(rows))
+            trials = TrialSource(stored.choose_pixels(pixels))
         notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
         return trials, notes
 
@@ -325,8 +325,8 @@ def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")
-    rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
-    if max_pixels is not None and len(rows) > max_pixels:
-        generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])
-        rows = np.sort(generator.permutation(rows)[:max_pixels])
-    return rows
+    pixels = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
+    if max_pixels is not None and len(pixels) > max_pixels:
+        generator = np.random.default_rng([PIXELS_STREAM, seed, len(pixels)])
+        pixels = np.sort(generator.permutation(pixels)[:max_pixels])
+    return pixels

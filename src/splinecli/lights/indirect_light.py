@@ -54,21 +54,21 @@ class IndirectLight:
     albedo: NDArray[np.floating]  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
-    def at(self, rows: Rows) -> Floats:
+    def at(self, pixels: Rows) -> Floats:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
-        arriving = self.blocks.sample(self.arriving, *self.pixels.places(rows))
-        return np.asarray(arriving * self.albedo[rows, None], np.float32)
+        arriving = self.blocks.sample(self.arriving, *self.pixels.places(pixels))
+        return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
-    def remove(self, observations: Floats, rows: Rows) -> Floats:
+    def remove(self, observations: Floats, pixels: Rows) -> Floats:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
         # Something is left of each observation, because what is gathered is never exact.
-        return np.asarray(np.maximum(observations - self.at(rows), 0.02 * observations), np.float32)
+        return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
-    def counts_at(self, observations: Floats, rows: Rows) -> NDArray[np.bool_]:
+    def counts_at(self, observations: Floats, pixels: Rows) -> NDArray[np.bool_]:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
         # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at
         # most.
-        return np.asarray(self.at(rows).max(axis=1) > 0.02 * observations.max(axis=1))
+        return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
 def find_indirect_light(
@@ -155,13 +155,13 @@ def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, 
     """
     found = []
     step = max(1, len(normals) // 50_000)
-    for rows in parts_of_rows(len(normals), step=step):
-        light = light_of(rows)
-        gathered = indirect.at(rows)
+    for pixels in parts_of_rows(len(normals), step=step):
+        light = light_of(pixels)
+        gathered = indirect.at(pixels)
         # In attached shadows, the cosine of the angle between light and normal is negative.
-        shadow = (_cosines(light, normals[rows]) < -0.05) & (gathered > 0)
-        albedo = np.broadcast_to(indirect.albedo[rows, None], shadow.shape)
-        found.append(np.stack((observations[rows][shadow], gathered[shadow], albedo[shadow])))
+        shadow = (_cosines(light, normals[pixels]) < -0.05) & (gathered > 0)
+        albedo = np.broadcast_to(indirect.albedo[pixels, None], shadow.shape)
+        found.append(np.stack((observations[pixels][shadow], gathered[shadow], albedo[shadow])))
     seen, gathered, albedo = np.hstack(found).astype(np.float64)
     if len(seen) < 50:
         return None

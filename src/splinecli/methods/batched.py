@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.lights.lamp_light import LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
 from splinecli.methods.estimator import (
     TOWARDS_CAMERA,
@@ -167,10 +167,10 @@ class NetworkEstimator(Estimator):
         if not self.network.config.sees_capture or not n_pixels:
             return self
         light = light_of(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
-        rows = sample_of(light.observations)
+        pixels = sample_of(light.observations)
         sample, lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
-            for values in (light.observations[rows], directions_at(light.directions, rows))
+            for values in (light.observations[pixels], directions_at(light.directions, pixels))
         )
         found = copy.copy(self)
         # One thread, so that the number of threads does not change the rounding.
@@ -193,9 +193,11 @@ class NetworkEstimator(Estimator):
         The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
         if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
-            alone = self.bind(
-                lambda rows: LampLight(observations[rows], directions_at(light_directions, rows)), len(observations)
-            )
+
+            def light_of(pixels: Rows) -> LampLight:
+                return LampLight(observations[pixels], directions_at(light_directions, pixels))
+
+            alone = self.bind(light_of, len(observations))
             return alone.estimate_with_error(observations, light_directions, progress=progress)
         results = estimate_in_batches(
             self._average_rotations,

@@ -85,8 +85,8 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
     left = order[n_even:]
     # One pixel of each group in turn, until there are enough.
     turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
-    rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
-    return PixelSample(rows, features[centres], rare, reach)
+    pixels = torch.cat((order[:n_even], left[turns[: size - n_even]]))
+    return PixelSample(pixels, features[centres], rare, reach)
 
 
 def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -194,11 +194,11 @@ class Perceptron(nn.Module):
         for _ in range(steps):
             if len(order) < BATCH:
                 order = torch.randperm(len(inputs), generator=generator)
-            rows, order = order[:BATCH].to(inputs.device), order[BATCH:]
-            found, found_errors = self(inputs[rows])
+            pixels, order = order[:BATCH].to(inputs.device), order[BATCH:]
+            found, found_errors = self(inputs[pixels])
             # The angle, not its square: the estimator's own outliers must not draw the normals of other pixels.
-            angle = (((found - normals[rows]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
-            loss = angle.mean() + 0.05 * (found_errors - errors[rows]).square().mean()
+            angle = (((found - normals[pixels]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
+            loss = angle.mean() + 0.05 * (found_errors - errors[pixels]).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -344,8 +344,8 @@ def distil(
         # At most 1 % of the pixels, and twice the sample, are of rare kinds and go through the network.
         rare_share = min(0.01, 2 * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
-        rows = sample.rows.numpy()
-        taught = teacher.estimate_with_error(candidates[rows], directions_at(directions, rows), progress=progress)
+        pixels = sample.rows.numpy()
+        taught = teacher.estimate_with_error(candidates[pixels], directions_at(directions, pixels), progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
         normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
         held = round(len(inputs) / 8)  # the first pixels are an even sample of all

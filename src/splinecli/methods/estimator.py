@@ -53,9 +53,9 @@ Directions = NDArray[np.floating]
 the camera."""
 
 
-def directions_at(light_directions: Directions, rows: slice | NDArray[Any]) -> Directions:
+def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) -> Directions:
     """Return the light directions of some pixels: those that all pixels share, or the pixels' own."""
-    return light_directions if light_directions.ndim == 2 else light_directions[rows]
+    return light_directions if light_directions.ndim == 2 else light_directions[pixels]
 
 
 TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own

@@ -43,8 +43,8 @@ def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the rows of the pixels, with observations (P, F), that the others see: at most SAMPLE lit ones, evenly
     spread. Where none is lit, the first one stands for all.
     """
-    rows, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
-    return rows if len(rows) else np.zeros(1, np.intp)
+    pixels, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
+    return pixels if len(pixels) else np.zeros(1, np.intp)
 
 
 def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
