@@ -334,7 +334,7 @@ def _make_files(
             {**report, "seconds": clock.seconds()},
             estimate.normal_map,
             capture.mask,
-            values={name: values for name, values in made.items() if MAPS[name].caption},
+            values={name: made[name] for name, row in MAPS.items() if name in made and row.caption},
             error_map_deg=estimate.error_map_deg,
             light_plot=light_plot,
         )
