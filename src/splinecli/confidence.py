@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
@@ -16,15 +15,11 @@ from splinecli.lights.indirect_light import PixelPlaces
 from splinecli.lights.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.lights.rough_normals import smooth_normals
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
-
-Doubles = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Floats32 = NDArray[np.float32]
-Places = NDArray[np.integer]
 
 FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
 
@@ -38,7 +33,7 @@ _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
 def correct_errors(
-    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Floats32, errors: Floats32
+    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Singles, errors: Singles
 ) -> bool:
     """Correct the distributions of errors (P, 2) in place; return whether that was possible.
 
@@ -75,7 +70,7 @@ def correct_errors(
     return True
 
 
-def add_common_error(errors: Floats32, error_deg: float) -> None:
+def add_common_error(errors: Singles, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
     Wrong lights or values turn the normals together. The medians of both errors are added as those of independent
@@ -126,7 +121,7 @@ class PixelScale:
     width: float  # of the object, in pixels
     turning: Doubles  # (3, 3, 2), the turn of a normal by near lamps, over the normal and the place
 
-    def features(self, brightness: Floats, normals: Floats, rows: Places, columns: Places) -> Doubles:
+    def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Doubles:
         """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""
         places = self.places(rows, columns)
         turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
@@ -134,16 +129,16 @@ class PixelScale:
         turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
         return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
 
-    def places(self, rows: Places, columns: Places) -> Doubles:
+    def places(self, rows: Integers, columns: Integers) -> Doubles:
         """Return places (n, 2) from the middle of the object, x right and y up, in its widths."""
         return np.stack((columns - self.middle[1], self.middle[0] - rows), axis=1) / self.width
 
 
 def capture_features(
-    mask: NDArray[np.bool_],
+    mask: Bools,
     light_of: LightOf,
-    normals: Floats32,
-    errors: Floats32,
+    normals: Singles,
+    errors: Singles,
     lights: Doubles,
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
@@ -266,7 +261,7 @@ def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, 
     return rank, known, free, float(np.log(after / max(before, _LEAST_SHARE)))
 
 
-def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> tuple[float, float]:
+def _of_shape(mask: Bools, places: PixelPlaces, normals: Floats) -> tuple[float, float]:
     """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
     blocks = Blocks.over(mask, _BLOCKS)
     if min(blocks.mask.shape) < 2:

@@ -13,17 +13,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.lights.lamp_light import LampLight, LightOf, Rows, parts_of_rows
+from splinecli.maths import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-
 
 _BLOCKS = 1200  # parts of the surface that exchange light
 
@@ -35,7 +31,7 @@ _LEAST_Z = 0.15  # of a block's normal, for its area
 class PixelPlaces:
     """Rows and columns of the pixels of a mask. Two bytes a pixel, as captures may have many."""
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
+    def __init__(self, mask: Bools) -> None:
         kind = np.min_scalar_type(mask.shape[1])
         self._columns = np.concatenate([np.flatnonzero(row).astype(kind) for row in mask])
         self._ends = np.count_nonzero(mask, axis=1).cumsum()
@@ -50,21 +46,21 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Floats  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
-    albedo: NDArray[np.floating]  # (P,), the share of the arriving light that a pixel reflects
+    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
+    albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
-    def at(self, pixels: Rows) -> Floats:
+    def at(self, pixels: Rows) -> Singles:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
         arriving = self.blocks.sample(self.arriving, *self.pixels.places(pixels))
         return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
-    def remove(self, observations: Floats, pixels: Rows) -> Floats:
+    def remove(self, observations: Singles, pixels: Rows) -> Singles:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
         # Something is left of each observation, because what is gathered is never exact.
         return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
-    def counts_at(self, observations: Floats, pixels: Rows) -> NDArray[np.bool_]:
+    def counts_at(self, observations: Singles, pixels: Rows) -> Bools:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
         # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at
         # most.
@@ -72,7 +68,7 @@ class IndirectLight:
 
 
 def find_indirect_light(
-    mask: NDArray[np.bool_], observations: Floats, light_of: LightOf, normals: Floats
+    mask: Bools, observations: Singles, light_of: LightOf, normals: Singles
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
 
@@ -123,7 +119,7 @@ def find_indirect_light(
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
-def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Floats:
+def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Singles:
     """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
 
     Nothing between two blocks hides them from each other. `covered` (p,) is the share of each block that the mask
@@ -147,7 +143,7 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     return np.asarray(factors @ sent.astype(np.float32))
 
 
-def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, normals: Floats) -> float | None:
+def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf, normals: Singles) -> float | None:
     """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
@@ -179,14 +175,14 @@ def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, 
     return exposure if exposure > 0 else None
 
 
-def _albedo(light: LampLight, normals: Floats) -> Floats:
+def _albedo(light: LampLight, normals: Singles) -> Singles:
     """Return the albedos (n,) of matte pixels, in the unit of the observations."""
     cosines = _cosines(light, normals).clip(min=0)
     shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
     return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
 
 
-def _cosines(light: LampLight, normals: Floats) -> Floats:
+def _cosines(light: LampLight, normals: Singles) -> Singles:
     """Return the cosines (n, F) of the angles between normals (n, 3) and lights."""
     own, directions = light.in_frame_of_pixels(normals), light.directions.astype(np.float32)
     if directions.ndim == 2:
