@@ -10,8 +10,6 @@ real materials, none of which is matte, are worth. Both were fitted to captures 
 without these faults (benchmarks/capture_faults.py --fit).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
