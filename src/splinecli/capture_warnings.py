@@ -55,9 +55,7 @@ class CaptureWarning:
 
 AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` of the folder was subtracted")
 BLACK_PIXELS = WarningKind(
-    "black_pixels",
-    "Over 1 % of the pixels are black under every light",
-    "Use a mask, or expose longer",
+    "black_pixels", "Over 1 % of the pixels are black under every light", "Use a mask, or expose longer"
 )
 CONSTANT_LIGHT = WarningKind(
     "constant_light",
@@ -117,10 +115,7 @@ GROUND_TRUTH_SHIFTED = WarningKind(
 )
 GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was turned upside down")
 GROUND_TRUTH_Z = WarningKind(
-    "ground_truth_z",
-    "The ground truth points away from the camera",
-    "Negate its z",
-    severity="error",
+    "ground_truth_z", "The ground truth points away from the camera", "Negate its z", severity="error"
 )
 IMAGE_INCONSISTENT = WarningKind(
     "image_inconsistent",
@@ -170,9 +165,7 @@ LIGHT_ORDER = WarningKind(
     severity="error",
 )
 LIGHTS_ILL_CONDITIONED = WarningKind(
-    "lights_ill_conditioned",
-    "The lights determine the normals badly",
-    "Add lights from other sides",
+    "lights_ill_conditioned", "The lights determine the normals badly", "Add lights from other sides"
 )
 LIGHTS_MATCHED = WarningKind(
     "lights_matched",
@@ -222,21 +215,14 @@ NOT_DISTILLED = WarningKind(
     "none; `--method iw12` is faster",
 )
 PROFILE_UNREAD = WarningKind(
-    "profile_unread",
-    "The curve of a colour profile cannot be read",
-    "`--transfer linear`, `srgb` or `gamma:G`",
+    "profile_unread", "The curve of a colour profile cannot be read", "`--transfer linear`, `srgb` or `gamma:G`"
 )
 REFINED_LIGHTS = WarningKind(
-    "refined_lights",
-    "`--refine-lights` moved the light directions",
-    "Compare with the given directions",
+    "refined_lights", "`--refine-lights` moved the light directions", "Compare with the given directions"
 )
 REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
 REPEATED_IMAGES = WarningKind(
-    "repeated_images",
-    "Two images are equal, their lights are not",
-    "Replace one of them",
-    severity="error",
+    "repeated_images", "Two images are equal, their lights are not", "Replace one of them", severity="error"
 )
 ROUGH_LIGHTS = WarningKind(
     "rough_lights",

@@ -135,11 +135,7 @@ class PixelScale:
 
 
 def capture_features(
-    mask: Bools,
-    light_of: LightOf,
-    normals: Singles,
-    errors: Singles,
-    lights: Doubles,
+    mask: Bools, light_of: LightOf, normals: Singles, errors: Singles, lights: Doubles
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
 

@@ -141,24 +141,14 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture,
-    estimator: Estimator,
-    tile_pixels: int | None,
-    progress: Progress | None,
-    stage: Stage | None,
+    capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether they judge the whole capture.
 
     Methods without confidence have no distributions.
     """
     found = estimate_pixels(
-        capture.mask,
-        capture.observations,
-        light_on(capture),
-        estimator,
-        tile_pixels,
-        progress,
-        stage,
+        capture.mask, capture.observations, light_on(capture), estimator, tile_pixels, progress, stage
     )
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner

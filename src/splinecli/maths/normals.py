@@ -48,11 +48,7 @@ def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
 
 
 def encode_picture(
-    normals: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    *,
-    bits: int = 16,
-    convention: Convention = "opengl",
+    normals: NDArray[np.floating], mask: NDArray[np.bool_], *, bits: int = 16, convention: Convention = "opengl"
 ) -> NDArray[np.unsignedinteger]:
     """Encode a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
 

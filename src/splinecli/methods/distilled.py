@@ -237,12 +237,7 @@ class DistilledEstimator(Estimator):
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
-        self,
-        teacher: Estimator,
-        perceptron: Perceptron,
-        sample: PixelSample,
-        found: Distillation,
-        size: StudentSize,
+        self, teacher: Estimator, perceptron: Perceptron, sample: PixelSample, found: Distillation, size: StudentSize
     ) -> None:
         self._teacher, self._perceptron, self._sample, self._size = teacher, perceptron, sample, size
         self.distillation = found

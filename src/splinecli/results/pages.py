@@ -18,14 +18,7 @@ from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
 from splinecli.output_files import MAPS, NORMALS, PAGE, REPORT
-from splinecli.pictures.maps import (
-    PREVIEW_LIGHT,
-    TICKS,
-    TOP_DEG,
-    Picture,
-    colour_errors,
-    encode_png,
-)
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, Picture, colour_errors, encode_png
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
 from splinecli.system.machine import is_out_of_memory
