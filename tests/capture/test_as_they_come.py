@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from splinecli.diagnosis.evidence import Evidence
 
 import scenes
 from splinecli.calibration.balls import find_ball_files
@@ -20,7 +21,6 @@ from splinecli.capture import CaptureSource, Overrides, find_capture_files, open
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
 from splinecli.diagnosis.checks import check_evidence
-from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.summary import summarise_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.inference import estimate_normals

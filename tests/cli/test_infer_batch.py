@@ -218,7 +218,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
     expected = dict.fromkeys((*progress.STAGES, "total"), 0)
     for place, (stage, module, name) in enumerate((
         ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", infer, "distil_for"),
-        ("estimate", infer, "estimate_normals"), ("pictures", infer, "albedo_map"),
+        ("estimate", infer, "estimate_normals"), ("pictures", infer, "make_map"),
         ("surface", infer, "make_surface"), ("write", files, "encode_normals"),
     )):  # fmt: skip
         monkeypatch.setattr(module, name, takes(10**place, getattr(module, name)))

@@ -225,7 +225,7 @@ def weights(folder: Path) -> None:
 def training(folder: Path) -> None:
     """A finished run, a pixel set, and settings: reading them takes no training step."""
     from small_pixel_sets import matte_pixels
-    from splinecli.pixel_sets.writer import PixelSetWriter
+    from splinecli.pixel_sets.store import PixelSetWriter
 
     writer = PixelSetWriter(folder / "set")
     for name in "ab":

@@ -190,7 +190,7 @@ def test_python() -> None:
     images = images_of(observed(true))
     estimate = estimate_normals(images, None, INSIDE, method="ls")
     capture = estimate.capture
-    assert ESTIMATED_LIGHTS in [warning.code for warning in capture.warnings]
+    assert ESTIMATED_LIGHTS in [warning.kind for warning in capture.warnings]
     assert capture.light_errors_deg is not None and capture.light_errors_deg.shape == (10,)
     errors = angle_between_deg(estimate.normal_map[INSIDE], NORMALS[INSIDE])
     assert np.median(errors) < mean_angle(capture.light_directions, true) + 3

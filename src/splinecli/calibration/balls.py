@@ -40,8 +40,6 @@ DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: al
 SHORTEST_LENS = 0.7
 """Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
 
-EXIF_ERROR = 0.05
-"""Standard deviation of a focal length in EXIF, as a share: numbers are rounded, and focusing changes it."""
 
 _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
 _MILLIMETRES = {2: 25.4, 3: 10.0}
@@ -68,7 +66,8 @@ class View:
             nearest = self.shortest / float(self.matrix[0, 0])
             factor = nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
-            factor = math.exp(EXIF_ERROR * generator.normal())
+            # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing changes them.
+            factor = math.exp(0.05 * generator.normal())
         matrix = self.matrix.copy()
         matrix[:2, :2] *= factor
         return matrix
@@ -108,8 +107,6 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
 
 
 HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
-MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
-_MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed ball, not a lamp
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     # The blur removes bright single pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    if brightest <= MIN_CONTRAST * median or brightest <= 0:
+    if brightest <= 4.0 * median or brightest <= 0:  # smallest ratio of the highlight to the median of the ball
         raise InputError(
             "found no highlight in the ball",
             hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
@@ -149,7 +146,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     core = labels == light.argmax()
     y, x = np.nonzero(core)
     width = max(np.ptp(x), np.ptp(y))
-    if width > _MAX_WIDTH * 2 * circle.radius:
+    if width > 0.3 * 2 * circle.radius:  # a wider patch is a window or an overexposed ball, not a lamp
         problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
         raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.

@@ -1,5 +1,4 @@
-"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are; and the
-names of all files that splinecli writes for people, which are no photographs."""
+"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are."""
 
 from __future__ import annotations
 
@@ -21,64 +20,11 @@ from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
 from splinecli.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.output_files import FOUND_LIGHTS, PLOTS, own_files
+from splinecli.output_files import MAPS as MAPS
+from splinecli.output_files import NORMALS as NORMALS
+from splinecli.output_files import SCALED_MAPS as SCALED_MAPS
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
-
-NORMALS = {
-    "png": "normals.png",
-    "png8": "normals_8bit.png",
-    "npy": "normals.npy",
-    "tiff": "normals.tiff",
-    "exr": "normals.exr",
-}
-"""The file of the normal map in each format."""
-
-ERROR_MAP = "error_map.png"
-REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
-CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
-FOUND_LIGHTS = FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = (
-    "light_directions.txt",
-    "light_intensities.txt",
-    "lights.png",
-)
-"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
-
-GRADIENT, GRADIENT_TIFF = "gradient.npy", "gradient.tiff"
-CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF = "curvature.png", "curvature.npy", "curvature.tiff"
-RELIEF_PICTURE, RELIEF, RELIEF_TIFF = "relief.png", "relief.npy", "relief.tiff"
-MAPS = {
-    "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
-    "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
-    "preview": (PREVIEW,),
-    "gradient": (GRADIENT, GRADIENT_TIFF),
-    "curvature": (CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF),
-    "relief": (RELIEF_PICTURE, RELIEF, RELIEF_TIFF),
-}
-"""The files of each optional map."""
-
-SCALED_MAPS = ("curvature", "relief")  # maps whose picture has a fixed scale, which the user may choose
-OWN_FILES = (
-    *NORMALS.values(),
-    ERROR_MAP,
-    *(name for names in MAPS.values() for name in names),
-    *file_names(tuple(SURFACE_FILES)),
-    SURFACE_REPORT,
-    FOUND_MASK,
-    PAGE,
-    REPORT,
-)
-"""All files that `infer` and `integrate` may write into a capture's folder of results, but FOUND_LIGHTS."""
-
-PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
-    "calibration.png",
-    "light_noise.png",
-    "contact_sheet.png",
-    "curves.png",
-    "maps.png",
-)
-"""Pictures that the other commands write."""
-
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
@@ -233,7 +179,7 @@ IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
 
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
-    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *OWN_FILES, *FOUND_LIGHTS, *PLOTS)
+    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
     if Path(name).suffix in IMAGE_SUFFIXES
 )
 """Lower-case stems of pictures in a capture's folder that are not images of the object under one light. The folder of

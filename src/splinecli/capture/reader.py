@@ -331,7 +331,7 @@ def capture_from_arrays(
 
     observations, saturation, warnings, colours = collect_observations(pixels(), *sizes)
     if as_stored:
-        warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
+        warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
     if colours is not None:
         intensities = intensities * colours
         observations = collect_observations(pixels(), *sizes)[0]

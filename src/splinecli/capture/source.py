@@ -140,12 +140,12 @@ class CaptureSource:
         observations, saturation, warnings, colours = collected
         equal = self.intensities_known and not self.intensities_measured
         if equal or as_stored or not divide_colours:
-            warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
+            warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
         if colours is not None:  # only the mean of the channels was kept, so the images are read again
             del images, collected, observations
             rgb = self.light_intensities.copy()
             rgb[list(indices)] *= colours
-            warnings = [each for each in warnings if each.code == ESTIMATED_COLOURS]
+            warnings = [each for each in warnings if each.kind == ESTIMATED_COLOURS]
             again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
             stored = again.read_stored(indices, progress, divide_colours=False)
             return replace(stored, capture=replace(stored.capture, estimated_colours=colours))

@@ -17,7 +17,7 @@ from splinecli.training import defaults
 if TYPE_CHECKING:
     from splinecli.training.config_files import Settings
     from splinecli.training.loop import Trainer
-    from splinecli.training.run_log import Metrics
+    from splinecli.training.run_files import Metrics
 
 
 def import_weights(

@@ -18,10 +18,11 @@ from typing import Any, Literal, NamedTuple
 
 from splinecli import __version__
 from splinecli.capture import capture_name
-from splinecli.capture.files import IMAGE_SUFFIXES, MAPS, NORMALS, OWN_FILES, REPORT, SCALED_MAPS
+from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
+from splinecli.output_files import MAPS, NORMALS, REPORT, SCALED_MAPS, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, ClusterOptions, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256, make_method
@@ -224,7 +225,7 @@ def find_earlier(
         if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
             raise ValueError
     except UnfinishedError as error:
-        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        found = next((name for name in own_files() if (target / name).exists()), None)
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
@@ -251,9 +252,6 @@ def find_earlier(
     if stamp != inputs_sha256(options.open(folder), options.weights):
         raise ChangedError("from other input files", target)
     return report
-
-
-_ASKED = 16  # captures that stand for a batch
 
 
 def infer_batch(
@@ -399,6 +397,6 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
     """
     if choose_device(options.device).type == "cuda":
         return 1
-    asked = members[:: max(1, len(members) // _ASKED)]
+    asked = members[:: max(1, len(members) // 16)]  # captures that stand for a batch
     each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
     return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

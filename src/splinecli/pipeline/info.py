@@ -12,8 +12,8 @@ from splinecli.capture.formats.images import common_size
 from splinecli.capture.light_files import check_writable, encode_lights
 from splinecli.capture.record import FoundLights
 from splinecli.capture_warnings import estimated_lights
-from splinecli.diagnosis.checks import check_evidence
-from splinecli.diagnosis.evidence import Evidence
+from splinecli.diagnosis.capture_sample import CaptureSample
+from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
@@ -27,10 +27,7 @@ from splinecli.system.progress import SILENT, Observer
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net
-LEARNED_PER_SECOND = 1000  # of the sample of a distilled network, in the network and in learning
 DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
-SURFACE_PER_SECOND = 50_000  # integration, mesh and their files, on one core
-STARTING_SECONDS = 3
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -97,7 +94,9 @@ def describe_capture(
         check, warnings = None, summary.warnings()
         if summary.samples is not None:
             indices = range(source.n_lights)
-            check, found = check_evidence(Evidence.of_source(source, summary.samples, indices, strict=reading.strict))
+            check, found = check_sample(
+                CaptureSample.of_source(source, summary.samples, indices, strict=reading.strict)
+            )
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))
@@ -210,7 +209,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
-    first, seconds = summary.images[0], STARTING_SECONDS + _seconds(summary)
+    first, seconds = summary.images[0], 3 + _seconds(summary)
     view = find_view(source.facts[0], None)
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
@@ -256,7 +255,8 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "expect": {
             "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
-            "seconds_with_surface": round(seconds + summary.n_pixels / SURFACE_PER_SECOND),
+            # 50,000 pixels a second: integration, mesh and their files on one core
+            "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
 
@@ -266,4 +266,5 @@ def _seconds(summary: CaptureSummary) -> float:
     count = summary.n_pixels
     if count < AUTOMATIC_FROM:
         return count / PIXELS_PER_SECOND
-    return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
+    # The network sees and learns 1000 pixels of the sample a second.
+    return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND

@@ -6,8 +6,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.files import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
+from splinecli.output_files import CONTACT_SHEET
 from splinecli.pictures.maps import contact_sheet, encode_png
 from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
 from splinecli.pixel_sets.entries import (
@@ -18,8 +18,7 @@ from splinecli.pixel_sets.entries import (
     name_captures,
     save_rendered,
 )
-from splinecli.pixel_sets.store import MANIFEST, PixelSet
-from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pixel_sets.store import MANIFEST, PixelSet, PixelSetWriter
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
 from splinecli.system.progress import SILENT, Advance, Observer
 from splinecli.system.publishing import held_folder
