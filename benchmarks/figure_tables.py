@@ -15,7 +15,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs/figures.json"
-PAGES = ("README.md", "docs/measurements.md")
+PAGES = ("README.md", "docs/measurements.md", "docs/robustness.md")
 
 Measured = dict[str, dict[str, Any]]
 """By name of the measurement: {"version", "weights", "machine", "rows": {row: {column: number or text}}}."""

@@ -48,9 +48,19 @@ def test_links_resolve(page):
             assert anchor in anchors(target), link
 
 
-def test_every_page_is_linked_from_the_readme():
-    readme = text_of("README.md")
-    assert [page.name for page in DOCS.glob("*.md") if f"(docs/{page.name})" not in readme] == []
+def test_every_page_is_in_the_site():
+    """mkdocs.yml lists each page of the documentation and each command once, and nothing else."""
+    names = [by_name(page).removeprefix("docs/") for page in PAGES if page.name != "README.md"]
+    group: Any = typer.main.get_command(app)
+    names += ["index.md", "examples/README.md", *(f"commands/{command}.md" for command in group.commands)]
+    assert sorted(re.findall(r"^ +- .*: (\S+\.md)$", text_of("mkdocs.yml"), re.MULTILINE)) == sorted(names)
+
+
+def test_pages_are_short():
+    """No page has more than 1,500 words; cells and rules of tables are not words."""
+    words = {by_name(page): len(re.findall(r"\S*\w\S*", page.read_text("utf-8"))) for page in PAGES}
+    del words["CHANGELOG.md"]
+    assert {name: number for name, number in words.items() if number > 1500} == {}
 
 
 def commands() -> Iterator[tuple[str, str]]:
@@ -85,7 +95,7 @@ def test_commands_have_options_that_exist(page, command):
 
 
 def test_exit_codes():
-    codes = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text_of("docs/files-and-frames.md"), re.MULTILINE))
+    codes = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text_of("docs/warnings.md"), re.MULTILINE))
     assert codes.keys() == {"0", "1", "2", "3", "4", "5", "130"}
     for error, word in ((UsageError, "usage"), (InputError, "input"), (ModelError, "weights"), (OutputError, "output")):
         assert word in codes[str(error.exit_code)]
@@ -115,7 +125,7 @@ def test_fields_of_the_report():
     """The table of report.json names each of its fields, and no other."""
     golden = text_of("tests/golden/report_ls.json")
     fields = set(re.findall(r'^  "(\w+)":', golden, re.MULTILINE))
-    _, _, section = text_of("docs/infer.md").partition("## The report")
+    _, _, section = text_of("docs/results.md").partition("## The report")
     cells = re.findall(r"^\| (`[^|]*`) \|", section.partition("\n## ")[0], re.MULTILINE)
     assert {name for cell in cells for name in re.findall(r"`(\w+)`", cell)} == fields
 

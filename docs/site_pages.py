@@ -1,0 +1,88 @@
+"""Add to the site the pages that are not in docs/: the README as the first page, other pages, one page per command.
+
+mkdocs.yml names this file as a hook. Links lead from file to file of the repository; here they get the site's layout.
+"""
+
+import posixpath
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("README.md", "MODEL_CARD.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
+SCRIPTS = ("examples/python_api.py", "examples/train_shipped_weights.sh")
+COMMANDS = "commands"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    for name in (*PAGES, *SCRIPTS):
+        files.append(File.generated(config, site_name(name), content=(ROOT / name).read_text("utf-8")))
+    for name, text in command_pages().items():
+        files.append(File.generated(config, f"{COMMANDS}/{name}.md", content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Return the text of a page with the links of the site."""
+    here = page.file.src_uri
+    if here.startswith(f"{COMMANDS}/"):
+        return markdown
+    named = {site_name(name): name for name in PAGES}
+    folder = posixpath.dirname(named.get(here, f"docs/{here}"))
+
+    def link(found: re.Match[str]) -> str:
+        if "://" in found[1]:
+            return found[0]
+        target = site_name(posixpath.normpath(posixpath.join(folder, found[1])))
+        return "](" + posixpath.relpath(target, posixpath.dirname(here) or ".")
+
+    return re.sub(r"\]\(([^)\s#]+)", link, markdown)
+
+
+def site_name(name: str) -> str:
+    """Return the place in the site of a file of the repository."""
+    return "index.md" if name == "README.md" else name.removeprefix("docs/")
+
+
+def command_pages() -> dict[str, str]:
+    """Return name -> Markdown of each command, from its options, as for the man pages."""
+    import typer
+
+    from splinecli.cli.main import app, help_panels
+
+    sys.path.insert(0, str(ROOT / "man"))
+    from make_pages import EXAMPLES
+
+    group: Any = typer.main.get_command(app)
+    context = group.context_class(group, info_name="splinecli", **group.context_settings)
+    pages = {}
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        own = command.context_class(command, info_name=name, parent=context)
+        lines = [
+            f"# splinecli {name}",
+            "",
+            "```text",
+            own.command_path + " " + " ".join(command.collect_usage_pieces(own)),
+        ]
+        lines += ["```", "", plain(command.help), ""]
+        examples = [(line, words) for line, words in EXAMPLES.items() if line.split()[1] == name]
+        lines += ["## Examples", ""] if examples else []
+        for line, words in examples:
+            lines += [plain(words), "", "```sh", line, "```", ""]
+        for title, rows in help_panels(command, own).items():
+            lines += [f"## {title}", "", "| option | meaning |", "|---|---|"]
+            lines += [f"| `{term}` | {plain(meaning)} |".replace("\n", " ") for term, meaning in rows]
+            lines.append("")
+        pages[name] = "\n".join(lines)
+    return pages
+
+
+def plain(text: str) -> str:
+    """Return text without a meaning in Markdown."""
+    return re.sub(r"([|*_\\<])", r"\\\1", text)
