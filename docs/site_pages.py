@@ -85,4 +85,4 @@ def command_pages() -> dict[str, str]:
 
 def plain(text: str) -> str:
     """Return text without a meaning in Markdown."""
-    return re.sub(r"([|*_\\<])", r"\\\1", text)
+    return re.sub(r"([|*_\\])", r"\\\1", text).replace("<", "&lt;")
