@@ -81,6 +81,8 @@ class Table:
             return "(not measured with these weights)"
         lines = ["| " + " | ".join((self.head, *self.columns)) + " |", "|---|" + "---:|" * len(self.columns)]
         for label, row in self.rows.items():
+            if row not in known:
+                continue  # not measured at all
             values = [known.get(row, {}).get(column, "-") for column in self.columns.values()]
             shown = (value if isinstance(value, str) else self.form.format(value) for value in values)
             lines.append("| " + " | ".join((label, *shown)) + " |")
