@@ -83,7 +83,7 @@ class Table:
         for label, row in self.rows.items():
             if row not in known:
                 continue  # not measured at all
-            values = [known.get(row, {}).get(column, "-") for column in self.columns.values()]
+            values = [known[row].get(column, "-") for column in self.columns.values()]
             shown = (value if isinstance(value, str) else self.form.format(value) for value in values)
             lines.append("| " + " | ".join((label, *shown)) + " |")
         captions = dict.fromkeys(caption(measured[source], weights) for source in sources if source != PUBLISHED)
