@@ -7,91 +7,96 @@ directions, and beside published methods.
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("svg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from figure_tables import FIGURES, LIGHTS, NOISE_DEG, OBJECTS, PUBLISHED, Measured
 
 PICTURES = FIGURES.parent / "pictures"
-METHODS = ("ls", "iw12", "ia14", "spline-net-pixelwise", "spline-net")
-COLOURS = dict(zip(METHODS, ("#888888", "#c98a1b", "#3c8c40", "#7986cb", "#1a237e"), strict=True))
+COLOURS = {
+    "ls": "#888888",
+    "iw12": "#c98a1b",
+    "ia14": "#3c8c40",
+    "spline-net-pixelwise": "#7986cb",
+    "spline-net": "#1a237e",
+}
+STYLE = {"svg.hashsalt": "splinecli", "svg.fonttype": "none"}  # the same file each time, with text as text
 
 
-def over_lights(measured: Measured) -> None:
-    """Draw the mean error of the three objects over the number of lights."""
-    _, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
-    for method in METHODS:
-        means = []
-        for count in LIGHTS:
-            cells = measured[f"lights-{count}"]["rows"][method]
-            means.append(sum(cells[f"{label} {count}"] for label in OBJECTS) / len(OBJECTS))
-        axes.plot(LIGHTS, means, "o-", color=COLOURS[method], label=method)
+def over_lights(measured: Measured) -> Figure:
+    """Return a plot of the mean error of the three objects over the number of lights."""
+    cells = {count: measured[f"lights-{count}"]["rows"] for count in LIGHTS}
+    means = {
+        method: [sum(cells[count][method][f"{label} {count}"] for label in OBJECTS) / len(OBJECTS) for count in LIGHTS]
+        for method in COLOURS
+    }
+    figure = curves(LIGHTS, means, "number of lights")
+    axes = figure.axes[0]
     axes.set_xscale("log")
     axes.set_xticks(LIGHTS, [str(count) for count in LIGHTS])
     axes.minorticks_off()
-    finish(axes, "number of lights")
-    save("accuracy_lights.svg")
+    return figure
 
 
-def over_noise(measured: Measured) -> None:
-    """Draw the mean error of the three objects over the noise of the light directions."""
-    _, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+def over_noise(measured: Measured) -> Figure:
+    """Return a plot of the mean error of the three objects over the noise of the light directions."""
     sigmas = (0.0, *NOISE_DEG)
-    for method in METHODS:
-        cells = measured["noise"]["rows"][method]
-        axes.plot(sigmas, [cells[f"{sigma:g}"] for sigma in sigmas], "o-", color=COLOURS[method], label=method)
-    finish(axes, "sigma of the light directions in degrees")
-    save("accuracy_noise.svg")
+    rows = measured["noise"]["rows"]
+    errors = {method: [rows[method][f"{sigma:g}"] for sigma in sigmas] for method in COLOURS}
+    return curves(sigmas, errors, "sigma of the light directions in degrees")
 
 
-def beside_published(measured: Measured) -> None:
-    """Draw the errors on each object under ten lights, beside published ones."""
-    published = {name: cells for name, cells in measured[PUBLISHED]["rows"].items() if "Reading 10" in cells}
+def beside_published(measured: Measured) -> Figure:
+    """Return a plot of the errors on each object under ten lights, for published methods and ours."""
     ours = {f"{name} (ours)": measured["lights-10"]["rows"][name] for name in ("ls", "spline-net")}
-    labels = list(OBJECTS)
-    rows = {name: cells for name, cells in {**published, **ours}.items() if all(f"{o} 10" in cells for o in labels)}
-    _, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    columns = [f"{label} 10" for label in OBJECTS]
+    rows = {**measured[PUBLISHED]["rows"], **ours}
+    rows = {name: cells for name, cells in rows.items() if set(columns) <= cells.keys()}
+    figure = empty_figure("")
+    axes = figure.axes[0]
     width = 0.8 / len(rows)
     for k, (name, cells) in enumerate(rows.items()):
-        colour = "#1a237e" if name.startswith("spline-net") else plt.get_cmap("Greys")(0.25 + 0.5 * k / len(rows))
-        heights = [cells[f"{label} 10"] for label in labels]
-        axes.bar(
-            [x + (k - (len(rows) - 1) / 2) * width for x in range(len(labels))],
-            heights,
-            width,
-            color=colour,
-            label=name,
-        )
-    axes.set_xticks(range(len(labels)), labels)
-    finish(axes, "")
-    save("accuracy_published.svg")
-
-
-def finish(axes: Axes, text: str) -> None:
-    axes.set_xlabel(text)
-    axes.set_ylabel("mean angular error in degrees")
-    axes.set_ylim(bottom=0)
-    axes.spines[["top", "right"]].set_visible(False)
+        colour = COLOURS["spline-net"] if name == "spline-net (ours)" else str(0.85 - 0.5 * k / len(rows))
+        places = [x + (k - (len(rows) - 1) / 2) * width for x in range(len(columns))]
+        axes.bar(places, [cells[column] for column in columns], width, color=colour, label=name)
+    axes.set_xticks(range(len(columns)), list(OBJECTS))
     axes.legend(frameon=False, fontsize="small")
+    return figure
 
 
-def save(name: str) -> None:
-    plt.savefig(PICTURES / name, metadata={"Date": None}, facecolor="white")
-    plt.close()
+def curves(x: Sequence[float], y: Mapping[str, Sequence[float]], label: str) -> Figure:
+    figure = empty_figure(label)
+    for method, errors in y.items():
+        figure.axes[0].plot(x, errors, "o-", color=COLOURS[method], label=method)
+    figure.axes[0].set_ylim(bottom=0)
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    return figure
 
 
-def main() -> None:
-    plt.rcParams["svg.hashsalt"] = "splinecli"
-    plt.rcParams["svg.fonttype"] = "none"
-    measured = json.loads(Path(FIGURES).read_text("utf-8"))
-    over_lights(measured)
-    over_noise(measured)
-    beside_published(measured)
+def empty_figure(label: str) -> Figure:
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel(label)
+    axes.set_ylabel("mean angular error in degrees")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+PLOTS = {
+    "accuracy_lights.svg": over_lights,
+    "accuracy_noise.svg": over_noise,
+    "accuracy_published.svg": beside_published,
+}
+
+
+def main(folder: Path = PICTURES) -> None:
+    measured = json.loads(FIGURES.read_text("utf-8"))
+    with matplotlib.rc_context(STYLE):
+        for name, plot in PLOTS.items():
+            plot(measured).savefig(folder / name, metadata={"Date": None}, facecolor="white")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import typer
 
+import figure_plots
 import figure_tables
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
@@ -150,6 +151,15 @@ def test_tables_of_figures(name):
 def test_every_table_of_figures_is_shown():
     shown = [found for name in figure_tables.PAGES for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))]
     assert sorted(shown) == sorted(figure_tables.TABLES)
+
+
+def test_plots_of_figures(tmp_path):
+    """The plots have a curve or a bar for each method that they name."""
+    figure_plots.main(tmp_path)
+    for name, methods in (("accuracy_lights.svg", figure_plots.COLOURS), ("accuracy_published.svg", ("PX-Net", "LS"))):
+        drawn = (tmp_path / name).read_text("utf-8")
+        assert all(f">{method}</text>" in drawn for method in methods)
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in DOCS.glob("pictures/accuracy_*.svg")}
 
 
 def test_figures_of_other_weights_are_marked():
