@@ -247,7 +247,7 @@ TARGETS = (
     )),
     Target("lights", light_files, ("*.txt", "*.npy", "*.csv"), (
         *each("infer . --method ls --lights {} -o out --overwrite", "vectors.npy utf16.txt commas.txt named.csv"),
-        "infer . --method ls --lights azel.txt --lights-format azel -o out --overwrite",
+        "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
         "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
         " --overwrite",
     )),
