@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import figure_tables as tables
-from figure_tables import FITS, NETWORKS, OBJECTS, SYNTH, Measured
+from figure_tables import FITS, NETWORKS, OBJECTS, RESTORED, SYNTH, Measured
 from splinecli import __version__
 
 if TYPE_CHECKING:
@@ -69,8 +69,15 @@ class Bench:
             for result in document["results"]
         ]
 
-    def lights(self, method: str, count: int) -> Cells:
-        found = self.errors("lights", self.objects, method, n_lights=(None if count == 96 else count,))
+    def lights(self, row: str, count: int) -> Cells:
+        restored = row == RESTORED
+        found = self.errors(
+            "lights-restored" if restored else "lights",
+            self.objects,
+            "spline-net" if restored else row,
+            n_lights=(None if count == 96 else count,),
+            as_stored=not restored,
+        )
         return {f"{r['label']} {count}": r["mae_deg"] for r in found}
 
     def noise(self, method: str) -> Cells:
@@ -97,12 +104,12 @@ class Bench:
         return cells
 
     def optics(self, convert: Callable[[Any], Any], name: str) -> Cells:
-        """Score the statues after a camera, on all pixels under one draw of ten lights."""
+        """Score the statues after a camera, on all pixels under one draw of ten lights, restored as `infer` does."""
         captures = {label: self.data / "statues" / label for label in tables.STATUES}
         copies = {label: rewritten(path, self.results / name, convert) for label, path in captures.items()}
         cells: Cells = {}
         for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
-            options = {"trials": 1, "seed": 3, "n_lights": (10,), "max_pixels": None}
+            options = {"trials": 1, "seed": 3, "n_lights": (10,), "max_pixels": None, "as_stored": False}
             found = self.errors(f"{name} errors", copies, method, **options)
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
@@ -240,7 +247,7 @@ class Bench:
         return {
             "calibration": each(self.calibration, tables.MIRROR_BALLS),
             **{
-                f"lights-{count}": {m: partial(self.lights, m, count) for m in (*FITS, *NETWORKS)}
+                f"lights-{count}": {m: partial(self.lights, m, count) for m in (*FITS, *NETWORKS, RESTORED)}
                 for count in (10, 96, 4, 20)
             },
             "cnn-ps": {"cnn-ps": partial(self.lights, "cnn-ps", 10)},

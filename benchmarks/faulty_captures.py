@@ -227,7 +227,7 @@ class Recorder:
 def store_captures(folder: Path, scenes: Sequence[int], size: int) -> None:
     torch.set_num_threads(1)
     estimator = make_estimator("spline-net")
-    recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[attr-defined]
+    recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[assignment,arg-type]
     for index in scenes:
         if (folder / f"{index:05d}.done").exists():
             continue

@@ -175,7 +175,7 @@ def moved(value: Any, device: Any) -> Any:
 
 def finish_set(folder: str) -> Row:
     """Finish a pixel set whose rendering was interrupted. Raises RuntimeError if it has too few scenes."""
-    from splinecli.pixel_sets.writer import PixelSetWriter
+    from splinecli.pixel_sets.store import PixelSetWriter
 
     entries = PixelSetWriter(Path(folder)).finish().entries
     shapes = len({entry.scene for entry in entries})

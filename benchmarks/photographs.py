@@ -65,7 +65,7 @@ def estimate(
 ) -> NDArray[np.float64]:
     """Return the errors (P,) in degrees."""
     seen, lights = torch.from_numpy(observations), torch.from_numpy(draw.lights).float()
-    context = network.look_at(seen[sample_of(observations)], lights)
+    context = network.encode_context(seen[sample_of(observations)], lights)
     normals, _ = network(seen, lights, None if valid is None else torch.from_numpy(valid), context=context)
     return angle_between_deg(normals.numpy(), draw.normals)
 

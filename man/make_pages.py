@@ -14,6 +14,7 @@ import typer
 from splinecli import __version__
 from splinecli.cli.main import app
 from splinecli.documents import json_schema
+from splinecli.output_files import MAPS
 
 EXIT_STATUS = {
     "0": "Done.",
@@ -40,19 +41,13 @@ FILES = {
     "OUT/NAME/normals.png": "Normal map, 16-bit RGB, (n + 1) / 2.",
     "OUT/NAME/normals.npy": "Normal map, float32, H x W x 3, zero outside the mask.",
     "OUT/NAME/normals_8bit.png, normals.tiff, normals.exr": "With --format png8, tiff, exr: normal map in 8 bits, in"
-    " float32, in float32 for renderers. exr also writes albedo.exr and depth.exr, if there are these maps.",
+    " float32, in float32 for renderers. tiff and exr also write the maps below in these formats, exr depth.exr.",
     "OUT/NAME/error_map.png": "If there are true normals: angular error with a color bar.",
     "OUT/NAME/found_mask.png": "With --auto-mask: the mask of the object.",
-    "OUT/NAME/albedo.png, albedo.npy": "With --maps albedo: a picture, and linear values in float32.",
-    "OUT/NAME/confidence.png, confidence.npy": "With --maps confidence: the probability that a normal has an error of"
-    " at most 5 degrees.",
-    "OUT/NAME/preview.png": "With --maps preview: the surface in matte white under a raking light.",
-    "OUT/NAME/gradient.npy": "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2.",
-    "OUT/NAME/gradient.tiff, curvature.tiff, relief.tiff": "With --format tiff: these maps as float32 TIFF, too.",
-    "OUT/NAME/curvature.npy": "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2.",
-    "OUT/NAME/curvature.png": "With --maps curvature: the mean curvature; gray is flat, bumps are brighter.",
-    "OUT/NAME/relief.npy": "With --maps relief: heights in pixels without the shape in the large, H x W.",
-    "OUT/NAME/relief.png": "With --maps relief: gray is 0, white is 1 pixel towards the camera.",
+    **{
+        f"OUT/NAME/{', '.join(each.files.values())}": f"With --maps {each.name}: {each.content}."
+        for each in MAPS.values()
+    },
     "OUT/frames/NAME": "The frames of a film, a capture of its own.",
     "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json. Both can write mesh.obj (with mesh.mtl and mesh.png) and mesh.stl.",

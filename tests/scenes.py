@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.methods.estimator import Estimator
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -138,7 +140,7 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
 
 
 @dataclass(kw_only=True)
-class Teacher:
+class Teacher(Estimator):
     """What estimators with confidence have in common; it counts the pixels that it is asked for."""
 
     name: str = "taught"
@@ -146,7 +148,7 @@ class Teacher:
     device: str = "cpu"
     precision: str = "float32"
     fingerprint: str = "taught"
-    tells_confidence: bool = True
+    has_confidence: bool = True
     asked: int = 0
 
     def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:

@@ -11,7 +11,6 @@ import pytest
 import typer
 
 import figure_tables
-from splinecli import capture_warnings
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 
@@ -119,12 +118,6 @@ def test_fields_of_the_report():
     _, _, section = text_of("docs/infer.md").partition("## The report")
     cells = re.findall(r"^\| (`[^|]*`) \|", section.partition("\n## ")[0], re.MULTILINE)
     assert {name for cell in cells for name in re.findall(r"`(\w+)`", cell)} == fields
-
-
-def test_every_warning_is_explained():
-    codes = {value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)}
-    explained = re.findall(r"^\| `(\w+)` \|", text_of("docs/troubleshooting.md"), re.MULTILINE)
-    assert sorted(codes) == explained
 
 
 def test_places_of_the_contributing_page():

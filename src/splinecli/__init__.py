@@ -68,7 +68,7 @@ def estimate_normals(
             lamps in the same unit, from the middle of the image on the object's mean plane.
         camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is near, compared with the object's width. The
             light directions are then in the frame of its axis. None is an orthographic camera.
-        method: "spline-net", "spline-net-pixelwise", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
+        method: a name of `splinecli infer --method`, such as "spline-net" or "ls"; see splinecli.methods.METHODS.
         as_stored: use the values of the images alone. By default, lens blur is removed, saturated observations
             are restored and unknown light intensities are estimated.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
@@ -104,7 +104,6 @@ def estimate_normals(
     import numpy as np
 
     from splinecli.capture.reader import capture_from_arrays
-    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
     from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator
@@ -135,7 +134,7 @@ def estimate_normals(
     check = partial(check_arrays, intensities=given)
     estimate, _ = estimate_capture(capture, estimator, check, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
-        if warning.code in PROBABLY_WRONG:
+        if warning.is_error:
             warn(str(warning), stacklevel=2)
     return estimate
 

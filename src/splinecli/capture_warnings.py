@@ -1,79 +1,267 @@
-"""Warnings about a capture: a stable code for programs, a sentence for people."""
+"""The warnings of a capture: one row of the table for each kind, with a stable code for programs.
+
+A check or a reader makes a warning of its row, with a sentence for people. The table of docs/troubleshooting.md, and
+what `--strict` refuses, follow from the rows (docs/make_tables.py).
+"""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from splinecli.maths import Doubles
+
+
+@dataclass(frozen=True)
+class WarningKind:
+    """A row of the table.
+
+    code: a name that stays the same when the sentences change.
+    meaning, remedy: for the documentation, in Markdown.
+    severity: "error" says that an input is probably wrong. With --strict it is an error.
+    """
+
+    code: str
+    meaning: str
+    remedy: str = "none"
+    severity: Literal["note", "error"] = "note"
+
+    @property
+    def is_error(self) -> bool:
+        return self.severity == "error"
 
 
 @dataclass(frozen=True)
 class CaptureWarning:
     """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
-    code: a name that stays the same when the sentence changes; one of the constants below.
     error_deg: the median angle in degrees by which normals are wrong if the warning is right. The confidence falls by
         it. None if the normals are not concerned, or the confidence accounts for the fault in another way.
     """
 
-    code: str
+    kind: WarningKind
     text: str
     error_deg: float | None = None
+
+    @property
+    def code(self) -> str:
+        return self.kind.code
+
+    @property
+    def is_error(self) -> bool:
+        return self.kind.is_error
 
     def __str__(self) -> str:
         return self.text
 
 
-AMBIENT_SUBTRACTED = "ambient_subtracted"
-BLACK_PIXELS = "black_pixels"
-CONSTANT_LIGHT = "constant_light"
-DARK_IMAGES = "dark_images"
-DIFFERENT_SIZES = "different_sizes"
-DISPLAY_DECODED = "display_decoded"
-DISPLAY_ENCODED = "display_encoded"
-EIGHT_BIT = "eight_bit"
-ENCODED_VALUES = "encoded_values"
-ESTIMATED_COLOURS = "estimated_colours"
-ESTIMATED_INTENSITIES = "estimated_intensities"
-ESTIMATED_LIGHTS = "estimated_lights"
-EXIF_ORIENTATION = "exif_orientation"
-FEW_LIGHTS = "few_lights"
-GROUND_TRUTH_FRAME = "ground_truth_frame"
-GROUND_TRUTH_SHIFTED = "ground_truth_shifted"
-GROUND_TRUTH_Z = "ground_truth_z"
-GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
-HIGH_LIGHTS = "high_lights"
-IMAGE_ODD = "image_odd"
-IMAGE_SCALE = "image_scale"
-IMAGES_LEFT_OUT = "images_left_out"
-IMAGES_SHIFTED = "images_shifted"
-LIGHTS_CROWDED = "lights_crowded"
-KEPT_LIGHTS = "kept_lights"
-LAMPS_NEAR = "lamps_near"
-LAMP_DISTANCE = "lamp_distance"
-LIGHTS_MATCHED = "lights_matched"
-LIGHTS_UNCHECKED = "lights_unchecked"
-LIGHT_COLOURS = "light_colours"
-LIGHT_FRAME = "light_frame"
-LIGHT_ORDER = "light_order"
-MASK_INVERTED = "mask_inverted"
-NEAR_LAMPS = "near_lamps"
-LOW_CONFIDENCE = "low_confidence"
-NOT_DISTILLED = "not_distilled"
-NO_MASK = "no_mask"
-PROFILE_UNREAD = "profile_unread"
-REPEATED_IMAGES = "repeated_images"
-REFINED_LIGHTS = "refined_lights"
-ROUGH_LIGHTS = "rough_lights"
-SATURATED = "saturated"
-UNEQUAL_INTENSITIES = "unequal_intensities"
-UNTRAINED_LIGHTS = "untrained_lights"
-WHITE_LEVEL = "white_level"
+AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` of the folder was subtracted")
+BLACK_PIXELS = WarningKind(
+    "black_pixels", "Over 1 % of the pixels are black under every light", "Use a mask, or expose longer"
+)
+CONSTANT_LIGHT = WarningKind(
+    "constant_light",
+    "The images look as if they contained [ambient light](#other-readings-of-the-images) or a black level",
+    "`--ambient IMAGE`, taken with all lamps off",
+    severity="error",
+)
+DARK_IMAGES = WarningKind("dark_images", "Images use little of the range", "Expose longer")
+DIFFERENT_SIZES = WarningKind("different_sizes", "The images have different sizes", "Export them in one size")
+DISPLAY_DECODED = WarningKind(
+    "display_decoded",
+    "The images state a curve, as JPEG does, and are read with it",
+    "`--transfer linear` if they are linear",
+)
+DISPLAY_ENCODED = WarningKind(
+    "display_encoded",
+    "Some images are JPEG or sRGB files, but are read as linear",
+    "`--transfer srgb`; none if they are linear",
+)
+EIGHT_BIT = WarningKind(
+    "eight_bit",
+    "The images have 8 bits",
+    "Export 16-bit linear images, or use RAW; [round](measurements.md#8-bits), do not cut",
+)
+ESTIMATED_COLOURS = WarningKind(
+    "estimated_colours",
+    "The lamps have different colours, which were estimated and divided out",
+    "RGB intensities with `--intensities FILE` if you measured them",
+)
+ESTIMATED_INTENSITIES = WarningKind(
+    "estimated_intensities",
+    "Light intensities were [estimated](infer.md#estimated-light-intensities)",
+    "`--intensities FILE` if you measured them",
+)
+ESTIMATED_LIGHTS = WarningKind(
+    "estimated_lights",
+    "The light directions were [found from the images](unknown-lights.md)",
+    "Measure the lights if the expected error is too large",
+)
+EXIF_EXPOSURE = WarningKind(
+    "exif_exposure",
+    "EXIF states different exposures, by which the images were divided",
+    "Expose all images alike, with exposure and white balance fixed",
+)
+EXIF_ORIENTATION = WarningKind(
+    "exif_orientation",
+    "An EXIF tag turns the images in viewers; splinecli uses the stored pixels",
+    "Make mask and lights for the stored pixels",
+)
+FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
+GROUND_TRUTH_FRAME = WarningKind(
+    "ground_truth_frame",
+    "The ground truth fits the images only with x or y negated, or exchanged",
+    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`",
+    severity="error",
+)
+GROUND_TRUTH_SHIFTED = WarningKind(
+    "ground_truth_shifted",
+    "The ground truth fits the images only when it is moved",
+    "Align it with the images",
+    severity="error",
+)
+GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was turned upside down")
+GROUND_TRUTH_Z = WarningKind(
+    "ground_truth_z", "The ground truth points away from the camera", "Negate its z", severity="error"
+)
+IMAGE_INCONSISTENT = WarningKind(
+    "image_inconsistent",
+    "One image [contradicts the others](#one-odd-image)",
+    "Photograph it again, or leave it out with `--light-indices`",
+    severity="error",
+)
+IMAGE_SCALE = WarningKind(
+    "image_scale",
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, as 12 bits among 16 are",
+    "Save all images in one way",
+    severity="error",
+)
+IMAGES_LEFT_OUT = WarningKind(
+    "images_left_out",
+    "The light file does not name all images, or pictures have names of masks or maps, or another size",
+    "Check names and sizes",
+)
+IMAGES_SHIFTED = WarningKind(
+    "images_shifted",
+    "Images are [shifted against the others](#shifted-images)",
+    "Photograph from a tripod, or align the images first",
+    severity="error",
+)
+LAMP_DISTANCE = WarningKind(
+    "lamp_distance",
+    "A lamp is nearer than the object is wide, or hundreds of widths away",
+    "Use one unit for lamps and pixel size",
+    severity="error",
+)
+LIGHT_COLOURS = WarningKind(
+    "light_colours",
+    "The lamps have different colours, and some lack a channel, so the colours cannot be divided out",
+    "White lamps, or RGB intensities",
+    severity="error",
+)
+LIGHT_FRAME = WarningKind(
+    "light_frame",
+    "The lights are probably in [another frame](#wrong-light-directions), rotated, or half vectors",
+    "`--light-frame` or `info --mended-lights`, as the warning says",
+    severity="error",
+)
+LIGHT_ORDER = WarningKind(
+    "light_order",
+    "The lights are probably in another order than the images",
+    "Correct the light file",
+    severity="error",
+)
+LIGHTS_ILL_CONDITIONED = WarningKind(
+    "lights_ill_conditioned", "The lights determine the normals badly", "Add lights from other sides"
+)
+LIGHTS_MATCHED = WarningKind(
+    "lights_matched",
+    "Lights were matched to images by another rule than the full name",
+    "Check the order of the lights",
+)
+LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the camera axis", "Add lower lights")
+LIGHTS_UNCHECKED = WarningKind(
+    "lights_unchecked",
+    "Shadows that the lights should cast are missing; with `--strict`, also where the order or the frame of the "
+    "lights [cannot be checked](#wrong-light-directions)",
+    "Compare bumps and hollows with the object",
+)
+LOW_CONFIDENCE = WarningKind(
+    "low_confidence",
+    "The network finds nearly all normals uncertain",
+    "Check the lights, the mask and the images",
+    severity="error",
+)
+MASK_CHOICE = WarningKind(
+    "mask_choice",
+    "There is no `mask.*`, so a picture with the word `mask` in its name, or the alpha channel of the images, is the "
+    "mask; of several pictures, none is",
+    "`--mask FILE` for another one",
+)
+MASK_INVERTED = WarningKind(
+    "mask_inverted",
+    "The mask leaves out a bright area in the middle",
+    "Invert it: white on the object",
+    severity="error",
+)
+NEAR_LAMPS = WarningKind(
+    "near_lamps",
+    "The folder has positions, or vectors look like positions, but the lights count as distant",
+    "`--light-positions FILE`, or leave `--lights` out",
+)
+NEAR_LIGHTS_SUSPECTED = WarningKind(
+    "near_lights_suspected",
+    "The images fit [near lamps](#other-readings-of-the-images) much better",
+    "[Say where they are](capture-and-calibrate.md#near-lamps)",
+    severity="error",
+)
+NO_MASK = WarningKind(
+    "no_mask", "No mask leaves out pixels, and most of them are near black", "`--auto-mask`, or a mask"
+)
+NONLINEARITY_SUSPECTED = WarningKind(
+    "nonlinearity_suspected",
+    "The images [look encoded](#other-readings-of-the-images), but are read as linear",
+    "`--transfer srgb` or `gamma:2.2`",
+    severity="error",
+)
+NOT_DISTILLED = WarningKind(
+    "not_distilled",
+    "A small network could not learn this large capture, so it took longer",
+    "none; `--method iw12` is faster",
+)
+PROFILE_UNREAD = WarningKind(
+    "profile_unread", "The curve of a colour profile cannot be read", "`--transfer linear`, `srgb` or `gamma:G`"
+)
+REFINED_LIGHTS = WarningKind(
+    "refined_lights", "`--refine-lights` moved the light directions", "Compare with the given directions"
+)
+REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
+REPEATED_IMAGES = WarningKind(
+    "repeated_images", "Two images are equal, their lights are not", "Replace one of them", severity="error"
+)
+ROUGH_LIGHTS = WarningKind(
+    "rough_lights",
+    "Refined light directions would fit much better",
+    "[`--refine-lights`](infer.md#rough-directions), or measure them again",
+)
+SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Expose shorter")
+UNEQUAL_INTENSITIES = WarningKind(
+    "unequal_intensities",
+    "Light intensities look unequal, but the images do not determine them; or those of the file do not fit the images",
+    "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
+    severity="error",
+)
+UNTRAINED_LIGHTS = WarningKind(
+    "untrained_lights",
+    "The weights were not trained with this number of lights",
+    "`--n-lights`, other weights, or `--method spline-net`",
+)
+WHITE_LEVEL = WarningKind(
+    "white_level",
+    "The images look clipped below full scale, or no value of 16-bit files is above 10 or 12 bits",
+    "`--white-level N` sets another value",
+)
 
-PROBABLY_WRONG = frozenset({
-    CONSTANT_LIGHT, ENCODED_VALUES, GROUND_TRUTH_FRAME, GROUND_TRUTH_SHIFTED, GROUND_TRUTH_Z, IMAGE_ODD, IMAGE_SCALE,
-    IMAGES_SHIFTED, LAMP_DISTANCE, LAMPS_NEAR, LIGHT_COLOURS, LIGHT_FRAME, LIGHT_ORDER, LOW_CONFIDENCE, MASK_INVERTED,
-    REPEATED_IMAGES, UNEQUAL_INTENSITIES,
-})  # fmt: skip
-"""Warnings that say that an input is probably wrong. With --strict they are errors."""
+WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
+PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
 
 SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
 

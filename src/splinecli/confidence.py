@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
@@ -16,33 +15,25 @@ from splinecli.lights.indirect_light import PixelPlaces
 from splinecli.lights.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.lights.rough_normals import smooth_normals
+from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-Doubles = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Floats32 = NDArray[np.float32]
-Places = NDArray[np.integer]
-
 FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
 
 FEWEST_PIXELS = 50
 
-_SAMPLE = 1500  # pixels
-_FACTOR_SAMPLE = 1000
 _BLOCKS = 2500  # over which normals are averaged for their curl
 _DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
 _FITS = 4
-_DECODING = 2.2  # an exponent close to the curve of sRGB
 _MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
-_GRAZING = 0.05  # cosine of the light, below which a prediction is too uncertain
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
 def correct_errors(
-    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Floats32, errors: Floats32
+    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Singles, errors: Singles
 ) -> bool:
     """Correct the distributions of errors (P, 2) in place; return whether that was possible.
 
@@ -79,10 +70,7 @@ def correct_errors(
     return True
 
 
-_COMMON_SHAPE = 3.5  # of the distribution of an error that all normals share: four of five are within a factor of 1.6
-
-
-def add_common_error(errors: Floats32, error_deg: float) -> None:
+def add_common_error(errors: Singles, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
     Wrong lights or values turn the normals together. The medians of both errors are added as those of independent
@@ -91,7 +79,8 @@ def add_common_error(errors: Floats32, error_deg: float) -> None:
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
     share = -np.expm1(own - 2 * errors[:, 0])
-    errors[:, 1] += share * (np.log(_COMMON_SHAPE) - errors[:, 1])
+    # The shape of an error that all normals share: four of five are within a factor of 1.6.
+    errors[:, 1] += share * (np.log(3.5) - errors[:, 1])
 
 
 class CaptureFeatures(NamedTuple):
@@ -132,7 +121,7 @@ class PixelScale:
     width: float  # of the object, in pixels
     turning: Doubles  # (3, 3, 2), the turn of a normal by near lamps, over the normal and the place
 
-    def features(self, brightness: Floats, normals: Floats, rows: Places, columns: Places) -> Doubles:
+    def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Doubles:
         """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""
         places = self.places(rows, columns)
         turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
@@ -140,17 +129,13 @@ class PixelScale:
         turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
         return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
 
-    def places(self, rows: Places, columns: Places) -> Doubles:
+    def places(self, rows: Integers, columns: Integers) -> Doubles:
         """Return places (n, 2) from the middle of the object, x right and y up, in its widths."""
         return np.stack((columns - self.middle[1], self.middle[0] - rows), axis=1) / self.width
 
 
 def capture_features(
-    mask: NDArray[np.bool_],
-    light_of: LightOf,
-    normals: Floats32,
-    errors: Floats32,
-    lights: Doubles,
+    mask: Bools, light_of: LightOf, normals: Singles, errors: Singles, lights: Doubles
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
 
@@ -163,7 +148,7 @@ def capture_features(
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
         return None
-    rows = np.arange(0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
+    rows = np.arange(0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
     light = light_of(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
@@ -238,7 +223,7 @@ def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles
 def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Doubles) -> Doubles:
     """Return what matte pixels with these normals (p, 3) and any albedo leave of values (p, F)."""
     cosines = (normals @ lights.T).clip(min=0)
-    seen = lit * (cosines > _GRAZING)
+    seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain
     weights = seen
     for _ in range(_FITS):
         albedo = (weights * values * cosines).sum(axis=1) / (weights * cosines**2).sum(axis=1).clip(min=1e-6)
@@ -258,11 +243,11 @@ def _turning(lights: Doubles) -> Doubles:
 
 def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, float]:
     """Return rank_residual, light_misfit, free_light_misfit and decoding; see CaptureFeatures."""
-    few = values[:: max(1, len(values) // max(_FACTOR_SAMPLE, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
+    few = values[:: max(1, len(values) // max(1000, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
     factors = find_factors(few)
     if factors is None:
         return (np.nan,) * 4
-    decoded = find_factors(np.maximum(few, 0) ** _DECODING)
+    decoded = find_factors(np.maximum(few, 0) ** 2.2)  # an exponent close to the curve of sRGB
     misfits = (each.misfits(lights[None])[0] for each in (factors, factors.with_free_intensities()))
     known, free = (float(np.log(misfit + _LEAST_SHARE)) for misfit in misfits)
     rank = float(np.log(factors.residual + _LEAST_SHARE))
@@ -272,7 +257,7 @@ def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, 
     return rank, known, free, float(np.log(after / max(before, _LEAST_SHARE)))
 
 
-def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> tuple[float, float]:
+def _of_shape(mask: Bools, places: PixelPlaces, normals: Floats) -> tuple[float, float]:
     """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
     blocks = Blocks.over(mask, _BLOCKS)
     if min(blocks.mask.shape) < 2:

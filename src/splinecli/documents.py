@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from msgspec.json import schema_components
 
-from splinecli import capture_warnings
 from splinecli.capture.record import MIN_LIGHTS
+from splinecli.capture_warnings import WARNINGS
 from splinecli.maths.normals import AngularErrors
 from splinecli.records import Count, Natural, NotNegative, Positive, Share
 from splinecli.restoration.images import WhiteLevel
@@ -19,16 +19,7 @@ Matrix = tuple[Vector, Vector, Vector]  # of a camera, in pixels
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 Camera = Literal["orthographic", "perspective"]
 Unit = Literal["pixel", "mean depth", "millimetre"]
-Code = Annotated[
-    str,
-    Meta(
-        extra_json_schema={
-            "enum": sorted(
-                {value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)}
-            )
-        }
-    ),
-]
+Code = Annotated[str, Meta(extra_json_schema={"enum": sorted(WARNINGS)})]
 LightCount = Annotated[int, Meta(ge=MIN_LIGHTS)]
 DrawnLights = LightCount | Literal["all"]
 ImageSize = tuple[Count, Count]  # width and height

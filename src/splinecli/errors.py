@@ -26,12 +26,7 @@ class SplinecliError(Exception):
     exit_code = 1
 
     def __init__(
-        self,
-        problem: str,
-        *,
-        path: str | Path | None = None,
-        line: int | None = None,
-        hint: str | None = None,
+        self, problem: str, *, path: str | Path | None = None, line: int | None = None, hint: str | None = None
     ) -> None:
         self.problem = problem
         self.path = None if path is None else Path(path)

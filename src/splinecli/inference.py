@@ -28,14 +28,11 @@ from splinecli.lights.indirect_light import IndirectLight, PixelPlaces, find_ind
 from splinecli.lights.lamp_light import LampLight, LightOf, Rows, flat_depth, parts_of_rows, surface_points
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator, make_estimator
-from splinecli.methods.estimator import TILE_PIXELS, confidence, for_capture, refiner_of, see_anew, tells_confidence
+from splinecli.methods.estimator import TILE_PIXELS, confidence
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
-
-ROUNDS = 2
-"""Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
 
 METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
 
@@ -52,7 +49,9 @@ def find_surface(capture: Capture) -> Capture:
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
-    for _ in range(ROUNDS):
+    # Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are
+    # enough.
+    for _ in range(2):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = LampLight.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
@@ -142,27 +141,17 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture,
-    estimator: Estimator,
-    tile_pixels: int | None,
-    progress: Progress | None,
-    stage: Stage | None,
+    capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether they judge the whole capture.
 
     Methods without confidence have no distributions.
     """
     found = estimate_pixels(
-        capture.mask,
-        capture.observations,
-        light_on(capture),
-        estimator,
-        tile_pixels,
-        progress,
-        stage,
+        capture.mask, capture.observations, light_on(capture), estimator, tile_pixels, progress, stage
     )
     normals, errors = found.normals, found.errors
-    refiner = refiner_of(estimator)
+    refiner = estimator.refiner
     if refiner is not None and errors is not None:
         with (stage or _no_stage)("refining") as advance:
             refiner.refine(capture.mask, capture.observations, found.light_of, normals, errors, progress=advance)
@@ -207,24 +196,22 @@ def estimate_pixels(
         light_without: gives the light of some pixels without indirect light, or with all that there is.
         tile_pixels, progress, stage: see estimate_normals.
     """
-    if tile_pixels is None:
-        tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
+    tile_pixels = tile_pixels or estimator.tile_pixels
     n_pixels = len(observations)
     normals = np.empty((n_pixels, 3), np.float32)
-    errors = np.empty((n_pixels, 2), np.float32) if tells_confidence(estimator) else None
+    errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
-    def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
-        if errors is not None and tells_confidence(estimator):
-            found, errors[rows] = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
-        else:
-            found = estimator.estimate(light.observations, light.directions, progress=progress)
-        normals[rows] = light.in_frame_of_capture(found)
+    def estimate(pixels: Rows, light: LampLight, progress: Progress | None = None) -> None:
+        found, of_pixels = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
+        if errors is not None:
+            errors[pixels] = of_pixels
+        normals[pixels] = light.in_frame_of_capture(found)
 
     light_of = partial(light_without, None)
-    refiner = refiner_of(estimator)
-    estimator = for_capture(estimator, light_of, n_pixels)
-    for rows in parts_of_rows(n_pixels, tile_pixels):
-        estimate(rows, light_of(rows), progress)
+    refiner = estimator.refiner
+    estimator = estimator.bind(light_of, n_pixels)
+    for pixels in parts_of_rows(n_pixels, tile_pixels):
+        estimate(pixels, light_of(pixels), progress)
     if refiner is None or errors is None:
         return PixelEstimates(normals, errors, light_of)
     with (stage or _no_stage)("removing indirect light") as advance:
@@ -232,12 +219,12 @@ def estimate_pixels(
         if indirect is not None:
             light_of = partial(light_without, indirect)
             # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
-            estimator = see_anew(estimator, light_of, n_pixels)
-            for rows in parts_of_rows(n_pixels, tile_pixels):
-                changed = rows[indirect.counts_at(observations[rows], rows)]
+            estimator = estimator.rebind(light_of, n_pixels)
+            for pixels in parts_of_rows(n_pixels, tile_pixels):
+                changed = pixels[indirect.counts_at(observations[pixels], pixels)]
                 if len(changed):
                     estimate(changed, light_of(changed))
-                advance(len(rows))
+                advance(len(pixels))
     return PixelEstimates(normals, errors, light_of)
 
 
@@ -248,17 +235,17 @@ def _no_stage(_: str) -> AbstractContextManager[Progress]:
 def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
     """Return what gives the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
     lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
-    pixels = PixelPlaces(capture.mask)
+    places = PixelPlaces(capture.mask)
 
-    def light_without(indirect: IndirectLight | None, rows: Rows) -> LampLight:
-        observations = capture.observations[rows]
+    def light_without(indirect: IndirectLight | None, pixels: Rows) -> LampLight:
+        observations = capture.observations[pixels]
         if indirect is not None:
-            observations = indirect.remove(observations, rows)
+            observations = indirect.remove(observations, pixels)
         if lamps is not None:
-            return LampLight.of(observations, lamps.choose_pixels(rows))
+            return LampLight.of(observations, lamps.choose_pixels(pixels))
         if camera_matrix is None:
             return LampLight(observations, directions)
-        return LampLight.distant(observations, directions, rays_at(*pixels.places(rows), camera_matrix))
+        return LampLight.distant(observations, directions, rays_at(*places.places(pixels), camera_matrix))
 
     return light_without
 

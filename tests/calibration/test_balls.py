@@ -8,12 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.conftest import Render
+from scenes import decode_rgb
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
-from splinecli.pictures.maps import calibration_picture
+from splinecli.pictures.plots import calibration_picture
 
 BALL = Circle(103.3, 88.7, 61.4)
 
@@ -47,9 +48,9 @@ def test_lights_of_a_ball(ball: Path, render_ball: Render, lights: NDArray[np.fl
     assert off.max() < (0.8 if outline == "--circle" else 1.8)
     half_way = angle_between_deg(found.normals, np.array((0.0, 0.0, 1.0)))
     np.testing.assert_allclose(half_way, np.linspace(0, 60, 7) / 2, atol=0.9)
-    picture = calibration_picture((found,))
-    assert picture.shape == (2 * 222, 6 * 200, 3)
-    red, green, _ = picture[:200, 200:400].astype(int).transpose(2, 0, 1)
+    picture = decode_rgb(calibration_picture((found,)))
+    assert picture.shape == (2 * 225, 6 * 200, 3)
+    red, green, _ = picture[:225, 200:400].astype(int).transpose(2, 0, 1)
     assert (red > green + 100).sum() > 20
     assert (green > red + 50).sum() > 200
 

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splinecli.capture import read_light_directions, read_light_intensities
+from splinecli.capture import find_capture_files, light_files, read_light_directions, read_light_intensities
+from splinecli.capture.formats.numbers import NumberRows, Row
 from splinecli.capture.light_files import NamedLights, read_lights
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
 ROWS = ["0 0 1", "0.6 0 0.8", "0 -0.6 0.8", "-0.48 0.36 0.8"]
@@ -250,3 +251,24 @@ def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str)
 def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_light_directions(write(tmp_path, text), form="azel")
+
+
+def test_a_format_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finding, reading, messages and help of a new format follow from its row."""
+
+    def read(path: Path, n_images: int | None, form: str) -> NumberRows:
+        numbers = [float(word) for word in path.read_text().split("|")]
+        return NumberRows(path, tuple(Row(tuple(numbers[at : at + 3]), None) for at in range(0, len(numbers), 3)))
+
+    row = light_files.LightFormat("bars", (".bars",), read, ("*.bars",), 2)
+    monkeypatch.setattr(light_files, "FORMATS", (*light_files.FORMATS, row))
+    for image in IMAGES:
+        (tmp_path / image.name).touch()
+    with pytest.raises(InputError, match=r"no light file \(.*, \*\.bars or light_positions\.txt\)"):
+        find_capture_files(tmp_path)
+    lights = write(tmp_path, "|".join(map(str, DIRECTIONS.ravel()))).rename(tmp_path / "a.bars")
+    assert find_capture_files(tmp_path).light_directions == lights
+    np.testing.assert_allclose(read_lights(lights, 4), DIRECTIONS, atol=1e-15)
+    assert light_files.light_suffixes().endswith(", .bars")
+    with pytest.raises(UsageError, match=r"type \.bars are only read\. Write \.txt, \.npy, \.lp or \.csv"):
+        light_files.check_writable(lights)

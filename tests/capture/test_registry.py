@@ -61,7 +61,7 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     for name, overrides, message in (
         ("nowhere", Overrides(), r"nowhere: the folder does not exist\."),
         ("file", Overrides(), r"found a file, expected a folder of images\."),
-        ("empty", Overrides(), r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA and RAW files count"),
+        ("empty", Overrides(), r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA,"),
         ("dataset", Overrides(), r"no images\. There are captures in .*dataset, such as .*a: give these"),
         ("dark", Overrides(), r"2 images but no light file \(light_directions.txt, .*Pass --lights FILE"),
         ("dark", Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"), r"none\.png: the file does"),

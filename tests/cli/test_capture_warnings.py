@@ -70,7 +70,7 @@ def test_a_black_image_is_named_without_intensities(run, medallion):
     cv2.imwrite(str(medallion / "04.png"), 0 * picture)
     result = run("infer", medallion, "--method", "ls")
     assert "04.png is black. Its lamp failed." in result.err
-    assert codes() == ["image_odd"]
+    assert codes() == ["image_inconsistent"]
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_lights_that_crowd(run, medallion, change, words):
     np.savetxt(medallion / "light_directions.txt", lights)
     for command in (("infer", medallion, "--method", "ls"), ("info", medallion)):
         assert words in run(*command).err
-    assert "lights_crowded" in codes()
+    assert "lights_ill_conditioned" in codes()
 
 
 def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):

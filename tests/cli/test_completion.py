@@ -5,9 +5,9 @@ import os
 import subprocess
 import sys
 
-from splinecli.capture.files import MAPS, NORMALS
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
+from splinecli.output_files import MAPS, NORMALS
 from splinecli.surface.surface_files import SURFACE_FILES
 from splinecli.training.config import PRESETS
 

@@ -21,7 +21,11 @@ def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
             advance(1, "calm")
     lines = capsys.readouterr().err.splitlines()
     assert LINE_SECONDS == 30
-    assert lines == ["cat: estimating: 30 %, calm", "cat: estimating: 60 %, calm", "cat: estimating: 90 %, calm"]
+    assert lines == [
+        "cat: estimating: 30 %, 70 s left, calm",
+        "cat: estimating: 60 %, 40 s left, calm",
+        "cat: estimating: 90 %, 10 s left, calm",
+    ]
     with Messages(quiet=False).progress("cat: refining", 100_000, unit="pixels") as advance:
         now += 40
         advance(25_000)

@@ -10,8 +10,8 @@ import pytest
 import typer
 
 from make_pages import EXAMPLES, FILES, man_pages
-from splinecli.capture.files import OWN_FILES
 from splinecli.cli.main import app
+from splinecli.output_files import own_files
 from splinecli.results.pages import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -43,7 +43,7 @@ def test_man_pages_are_typeset_without_warnings():
 
 def test_man_page_names_what_infer_writes():
     named = " ".join([*FILES, *FILES.values()])
-    assert [name for name in (*OWN_FILES, INDEX) if name not in named] == []
+    assert [name for name in (*own_files(), INDEX) if name not in named] == []
 
 
 @pytest.mark.parametrize("example", EXAMPLES)

@@ -16,18 +16,10 @@ import pytest
 import tifffile
 
 from cli.conftest import EXAMPLE, read_report
-from splinecli.capture.files import (
-    CONFIDENCE_PICTURE,
-    ERROR_MAP,
-    FOUND_MASK,
-    IMAGE_SUFFIXES,
-    LIGHT_PLOT,
-    MAPS,
-    NORMALS,
-    PLOTS,
-)
+from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.estimator import LeastSquares
+from splinecli.output_files import ERROR_MAP, FOUND_MASK, LIGHT_PLOT, MAPS, NORMALS, PLOTS
 from splinecli.surface.surface_files import SURFACE_FILES
 
 
@@ -334,7 +326,7 @@ def test_no_result_beside_the_images_counts_as_one_of_them(run, capture):
     [first] = json.loads(run(*arguments, "--maps", maps, "--format", ",".join(formats)).out)
     surface = [name for name in SURFACE_FILES if name != "exr"]
     assert run("integrate", capture, "--format", ",".join(surface), "--overwrite").code == 0
-    for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, CONFIDENCE_PICTURE, FOUND_MASK):
+    for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, "confidence.png", FOUND_MASK):
         if not (capture / name).exists():
             cv2.imwrite(str(capture / name), np.zeros((24, 24), np.uint8))
     pictures = {path.name for path in capture.glob("*") if path.suffix in IMAGE_SUFFIXES} - {"mask.png"}

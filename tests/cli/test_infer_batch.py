@@ -82,7 +82,7 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     links = re.findall(r'href="([^"]+)"', index)
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
     assert all((Path("out") / unquote(link)).is_file() for link in links)
-    assert "found neither PNG, TIFF, JPEG nor BMP" in index
+    assert "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC" in index
     pages = re.findall(r'<img src="data:image/jpeg;base64,([^"]+)" alt="Normal map of ([^"]+)"', index)
     assert [name for _, name in pages] == ["sphere", "a b"]
     normals = cv2.imread("out/sphere/normals.png", cv2.IMREAD_UNCHANGED) / 257
@@ -218,7 +218,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
     expected = dict.fromkeys((*progress.STAGES, "total"), 0)
     for place, (stage, module, name) in enumerate((
         ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", infer, "distil_for"),
-        ("estimate", infer, "estimate_normals"), ("pictures", infer, "albedo_map"),
+        ("estimate", infer, "estimate_normals"), ("pictures", infer, "make_map"),
         ("surface", infer, "make_surface"), ("write", files, "encode_normals"),
     )):  # fmt: skip
         monkeypatch.setattr(module, name, takes(10**place, getattr(module, name)))
@@ -347,3 +347,9 @@ def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch
     (document,) = json.loads(result.out)
     assert (result.code, document["capture"], document["exit_code"]) == (5, None, 5)
     assert not Path("out/second").exists()
+
+
+def test_images_in_place_of_their_folder(run, capture):
+    result = run("infer", *sorted(capture.glob("image*.png")), "--method", "ls")
+    expected = "splinecli: 8 images were given, expected their folder. Pass the folder: sphere.\n"
+    assert (result.code, result.err) == (2, expected)

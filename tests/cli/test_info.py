@@ -84,7 +84,8 @@ def test_warnings(run, capture):
     words = ("8 bits", "image2.png (100.0 %)", "5 % of the range: 1, such as image3.png")
     assert all(word in warning for word, warning in zip(words, warnings[:3], strict=True))
     cv2.imwrite(str(photographs[3]), stored[:20])
-    assert "The images have 2 different sizes" in run("info", str(capture), "--json").out
+    result = run("info", str(capture), "--json")
+    assert (result.code, "image4.png: found an image of 24 x 20 pixels, expected 24 x 24" in result.err) == (3, True)
 
 
 def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
@@ -113,3 +114,14 @@ def test_the_white_level_of_12_bit_data(run, capture):
     assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
     assert report["exposure"]["saturated"] > 0.1
     assert report["exposure"]["bright"][1] == pytest.approx(1)
+
+
+def test_auto_mask(run, capture):
+    (capture / "mask.png").unlink()
+    for path in capture.glob("image*.png"):
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        stored[:, :8] = 0
+        cv2.imwrite(str(path), stored)
+    result = run("info", capture, "--auto-mask", "--json")
+    report = json.loads(result.out)
+    assert (result.code, report["mask"], report["n_pixels"]) == (0, "found in the images", 24 * 16)

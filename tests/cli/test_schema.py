@@ -7,6 +7,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+from splinecli.capture_warnings import WARNINGS
 from splinecli.documents import json_schema
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
@@ -57,3 +58,7 @@ def test_results_of_evaluate(make_capture, run, lights):
 def test_the_published_schema_is_that_of_the_documents():
     """Made by `python man/make_pages.py`."""
     assert json_schema() == SCHEMA
+
+
+def test_the_codes_of_warnings_are_those_of_the_source():
+    assert SCHEMA["$defs"]["WarningReport"]["properties"]["code"]["enum"] == sorted(WARNINGS)

@@ -12,7 +12,7 @@ import pytest
 from small_pixel_sets import matte_pixels
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
-from splinecli.training.run_log import RunLog
+from splinecli.training.run_files import RunLog
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def settings() -> dict[str, Any]:
 
 def write_set(folder: str, *, finished: bool = True) -> None:
     """Matte pixels in three scenes under 14 lights."""
-    from splinecli.pixel_sets.writer import PixelSetWriter
+    from splinecli.pixel_sets.store import PixelSetWriter
 
     writer = PixelSetWriter(Path(folder))
     for seed, scene in enumerate("abc"):

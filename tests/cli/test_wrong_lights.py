@@ -164,7 +164,7 @@ def test_an_image_that_contradicts_the_others_is_named(run, medallion):
     result = run("info", medallion, "--strict", "--json")
     assert result.code == 3
     report = json.loads(result.out)
-    assert report["warning_codes"] == ["image_odd"]
+    assert report["warning_codes"] == ["image_inconsistent"]
     assert "07.png contradicts the other images and is 0.4" in report["warnings"][0]
     left_out = ",".join(str(place) for place in range(10) if place != 6)
     assert run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 SIZE = 48
 TWO_RINGS = np.concatenate((ring_lights(6, 55, 0.3), ring_lights(4, 30)))
 LIGHTS = {"two rings": TWO_RINGS, "one ring": ring_lights(8, 45, 0.2), "spiral": spiral_lights(10, 52, 15)}
-CODES = {"encoded_values", "lamps_near", "constant_light", "unequal_intensities"}
+CODES = {"nonlinearity_suspected", "near_lights_suspected", "constant_light", "unequal_intensities"}
 
 
 def surface(shape: str) -> tuple[Array, NDArray[np.bool_]]:
@@ -73,7 +73,7 @@ def test_encoded_values(shape: str, lights: str, known: bool) -> None:
     intensities = np.linspace(0.7, 1.3, len(directions)) if known else None
     linear = values(shape, directions) * (1 if intensities is None else intensities)
     (warning,) = found(shape, encode(linear / linear.max()), directions, intensities)
-    assert warning.code == "encoded_values" and "--transfer srgb" in warning.text
+    assert warning.code == "nonlinearity_suspected" and "--transfer srgb" in warning.text
     if not known:
         assert warning.error_deg == pytest.approx(error_of(encode(linear), directions, shape), rel=0.35)
 
@@ -83,7 +83,7 @@ def test_a_curve_behind_unequal_lamps() -> None:
     linear = values("bumps", LIGHTS["spiral"]) * intensities
     assert found("bumps", linear / linear.max(), LIGHTS["spiral"]) == []  # they are estimated, without a fault
     (warning,) = found("bumps", encode(linear / linear.max()), LIGHTS["spiral"])
-    assert warning.code == "encoded_values"
+    assert warning.code == "nonlinearity_suspected"
 
 
 @pytest.mark.parametrize("widths", [1.5, 2.0, 3.0, 4.0])
@@ -94,7 +94,7 @@ def test_near_lamps(shape: str, widths: float) -> None:
     towards, attenuations = lamps.light_at(lamps.plane_points(*np.nonzero(mask)))
     shaded = np.einsum("pfc,pc->pf", towards * attenuations[..., None], normals).clip(0)
     (warning,) = found(shape, shaded / shaded.max(), directions)
-    assert warning.code == "lamps_near" and warning.error_deg is not None
+    assert warning.code == "near_lights_suspected" and warning.error_deg is not None
     # An error of a quarter of the distance costs 2 to 4 degrees, where distant lights cost 6 to 20.
     stated = float(warning.text.split("--light-distance ")[1].split()[0])
     assert stated == pytest.approx(widths, rel=0.26)

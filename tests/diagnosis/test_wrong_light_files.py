@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 import scenes
 from scenes import directions_at, halfway, ring_lights, spiral_lights, square_grid
-from splinecli import capture_warnings as codes
+from splinecli import capture_warnings as kinds
 from splinecli.capture import Capture
 from splinecli.diagnosis.checks import check_arrays
 from splinecli.diagnosis.light_check import LightCheck, check_lights
@@ -152,11 +152,11 @@ def test_every_second_ring_of_a_dome_with_x_negated(case: tuple[float, float, fl
 
 
 FAULTS = {
-    "half vectors": (halfway(TWO_RINGS), codes.LIGHT_FRAME),
-    "rotated": (rotated(TWO_RINGS, 30), codes.LIGHT_FRAME),
-    "negated": (TWO_RINGS * (-1, -1, 1), codes.LIGHT_FRAME),
-    "reversed": (TWO_RINGS[::-1], codes.LIGHT_ORDER),
-    "shuffled": (np.random.default_rng(1).permutation(TWO_RINGS), codes.LIGHT_ORDER),
+    "half vectors": (halfway(TWO_RINGS), kinds.LIGHT_FRAME),
+    "rotated": (rotated(TWO_RINGS, 30), kinds.LIGHT_FRAME),
+    "negated": (TWO_RINGS * (-1, -1, 1), kinds.LIGHT_FRAME),
+    "reversed": (TWO_RINGS[::-1], kinds.LIGHT_ORDER),
+    "shuffled": (np.random.default_rng(1).permutation(TWO_RINGS), kinds.LIGHT_ORDER),
 }
 
 
@@ -176,6 +176,6 @@ def test_a_wrong_image_states_the_error_that_it_makes(fault: str) -> None:
     observations[:, 3] = 0 if fault == "black" else observations[:, 7]
     warnings = check_arrays(Capture("ball", observations, TWO_RINGS, np.arange(10), mask), intensities=np.ones(10))
     assert [warning.code for warning in warnings][:1] == [
-        codes.IMAGE_ODD if fault == "black" else codes.REPEATED_IMAGES
+        kinds.IMAGE_INCONSISTENT if fault == "black" else kinds.REPEATED_IMAGES
     ]
     assert warnings[0].error_deg is not None

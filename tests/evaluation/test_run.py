@@ -17,15 +17,15 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.maths.normals import unit
-from splinecli.methods import make_estimator
+from splinecli.methods import Estimator, make_estimator
 
 WriteDome = Callable[..., Path]
 
 
-class Fake:
+class Fake(Estimator):
     """Gives the folder's truth, turned by the next of the angles; remembers what it saw."""
 
-    weights, device, precision, fingerprint = None, "cpu", "float64", "fake"
+    fingerprint = "fake"
 
     def __init__(self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake") -> None:
         self.name = name

@@ -101,6 +101,17 @@ def tiff_capture(folder: Path) -> None:
     (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
 
 
+def pgm_capture(folder: Path) -> None:
+    for number, light in enumerate(LIGHTS):
+        cv2.imwrite(str(folder / f"{number}.pgm"), shaded(light))
+    np.savetxt(folder / "lights.txt", LIGHTS)
+
+
+def stack_capture(folder: Path) -> None:
+    tifffile.imwrite(folder / "stack.tif", np.stack([shaded(light) for light in LIGHTS]), photometric="minisblack")
+    np.savetxt(folder / "lights.txt", LIGHTS)
+
+
 def light_files(folder: Path) -> None:
     """Light files of every form, and near lamps."""
     for number, light in enumerate(LIGHTS):
@@ -112,6 +123,9 @@ def light_files(folder: Path) -> None:
     (folder / "utf16.txt").write_text("x y z\n" + "\n".join(rows), "utf-16")
     (folder / "commas.txt").write_text("\n".join(rows).replace(".", ",").replace(" ", ";"))
     (folder / "named.csv").write_text("\n".join(f"{number}.png;{row}" for number, row in enumerate(rows)))
+    (folder / "list.json").write_text(json.dumps(LIGHTS.tolist()))
+    lights = [dict(zip("xyz", light, strict=True)) for light in LIGHTS.tolist()]
+    (folder / "rig.dome").write_text(json.dumps({"directions": lights, "positionsSphere": lights}))
     np.savetxt(folder / "positions.txt", 60 * LIGHTS)
     np.savetxt(folder / "light_lobes.txt", np.column_stack((-LIGHTS, np.full(len(LIGHTS), 2))))
     (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
@@ -211,7 +225,7 @@ def weights(folder: Path) -> None:
 def training(folder: Path) -> None:
     """A finished run, a pixel set, and settings: reading them takes no training step."""
     from small_pixel_sets import matte_pixels
-    from splinecli.pixel_sets.writer import PixelSetWriter
+    from splinecli.pixel_sets.store import PixelSetWriter
 
     writer = PixelSetWriter(folder / "set")
     for name in "ab":
@@ -245,8 +259,11 @@ TARGETS = (
     Target("tiff", tiff_capture, ("*",), (
         "infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite",
     )),
-    Target("lights", light_files, ("*.txt", "*.npy", "*.csv"), (
-        *each("infer . --method ls --lights {} -o out --overwrite", "vectors.npy utf16.txt commas.txt named.csv"),
+    Target("pgm", pgm_capture, ("*.pgm",), ("infer . --method ls -o out --overwrite",)),
+    Target("stack", stack_capture, ("*.tif",), ("infer . --method ls -o out --overwrite", "info .")),
+    Target("lights", light_files, ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"), (
+        *each("infer . --method ls --lights {} -o out --overwrite",
+              "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome"),
         "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
         "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
         " --overwrite",

@@ -164,13 +164,13 @@ def prepare_process() -> None:
     import typer
 
     from splinecli.synthesis import meshes
-    from splinecli.training import run_log, tasks
+    from splinecli.training import run_files, tasks
 
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     typer.main.get_command = cache(typer.main.get_command)
     tasks.VALIDATION_PIXELS = 32
-    run_log.RunLog.draw = lambda *_: None
+    run_files.RunLog.draw = lambda *_: None
     meshes.split_long_edges = partial(meshes.split_long_edges, most_faces=10)
 
 

@@ -177,13 +177,13 @@ def test_the_refinement_sees_what_is_left() -> None:
 
 
 def test_the_capture_is_seen_anew_without_its_own_light() -> None:
-    seen, look = [], NetworkEstimator.for_capture
+    seen, look = [], NetworkEstimator.bind
 
-    def for_capture(estimator: NetworkEstimator, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+    def bind(estimator: NetworkEstimator, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
         seen.append(light_of(EVERYWHERE).observations)
         return look(estimator, light_of, n_pixels)
 
-    with patch.object(NetworkEstimator, "for_capture", for_capture):
+    with patch.object(NetworkEstimator, "bind", bind):
         estimate_normals(CAPTURE, make_estimator("spline-net"))
     before, after = seen
     np.testing.assert_array_equal(before, CAPTURE.observations)

@@ -90,7 +90,7 @@ def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
     assert refined.warnings[-1].code == "refined_lights"
     assert not np.array_equal(refined.light_directions, given)
     again = refine_capture(refined)
-    assert again.warnings[-1].code == "kept_lights"
+    assert again.warnings[-1].code == "refinement_rejected"
     np.testing.assert_array_equal(again.light_directions, refined.light_directions)
     with pytest.raises(UsageError, match="the light error is 0 degrees"):
         refine_capture(capture, error_deg=0.0)

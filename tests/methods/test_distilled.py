@@ -19,9 +19,7 @@ from splinecli.methods.estimator import (
     LeastSquares,
     StudentSize,
     confidence,
-    refiner_of,
     student_sizes,
-    tells_confidence,
 )
 from splinecli.networks.refine_net import RefineNet
 from splinecli.refinement.refiner import NetworkRefiner
@@ -87,7 +85,7 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
     normals, observations = glossy()
     teacher = sure(observations, noisy(normals, 4), 4)
     found = learn(teacher)
-    assert tells_confidence(found)
+    assert found.has_confidence
     error = angle_between_deg(found.estimate(observations, LIGHTS), normals).mean()
     assert angle_between_deg(teacher.normals, normals).mean() == pytest.approx(4, abs=0.1)
     assert angle_between_deg(LeastSquares().estimate(observations, LIGHTS), normals).mean() > 4
@@ -108,7 +106,7 @@ def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> 
     said = normals[:, [1, 0, 2]] if followed else noisy(normals, 40)
     teacher = sure(np.concatenate((observations, changed)), np.concatenate((normals, said)), 4)
     found = distil(teacher, distant(observations), 8000, SIZE)
-    anew = found.learn_anew(distant(changed), 8000)
+    anew = found.rebind(distant(changed), 8000)
     assert angle_between_deg(anew.estimate_with_error(changed, LIGHTS)[0], said).mean() < 3
     if followed:
         assert isinstance(anew, DistilledEstimator) and anew.n_unlike < 1000
@@ -183,10 +181,10 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
 def test_its_map_is_refined_by_its_teacher() -> None:
     normals, observations = glossy(3000)
     teacher = sure(observations, normals)
-    assert refiner_of(learn(teacher, SMALL)) is None
-    teacher.refiner = NetworkRefiner(RefineNet(), "float32")  # type: ignore[attr-defined]
-    refiner = refiner_of(learn(teacher, SMALL))
-    assert refiner is teacher.refiner  # type: ignore[attr-defined]
+    assert learn(teacher, SMALL).refiner is None
+    teacher.refiner = NetworkRefiner(RefineNet(), "float32")
+    refiner = learn(teacher, SMALL).refiner
+    assert refiner is teacher.refiner
 
 
 def test_too_few_pixels() -> None:

@@ -11,7 +11,6 @@ from splinecli.lights.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
 from splinecli.methods.batched import NetworkEstimator, rotations_of
-from splinecli.methods.estimator import for_capture
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from tiny_networks import random_network
@@ -94,7 +93,7 @@ def light_of(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> 
 def test_pixels_see_their_capture_and_not_their_tile() -> None:
     observations, lights = pixels(600)
     network = estimator(random_network(**SEES), batch_size=100)
-    whole = network.for_capture(light_of(observations, lights), 600)
+    whole = network.bind(light_of(observations, lights), 600)
     expected, errors = whole.estimate_with_error(observations, lights)
     for tile in (slice(0, 30), slice(250, 600)):
         found, found_errors = whole.estimate_with_error(observations[tile], lights)
@@ -113,7 +112,7 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     expected = network.estimate(observations, lights)
     dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
     with_background = np.concatenate((dark[:400], observations, dark[400:]))
-    found = network.for_capture(light_of(with_background, lights), 1000).estimate(with_background, lights)
+    found = network.bind(light_of(with_background, lights), 1000).estimate(with_background, lights)
     assert angle_between_deg(found[400:600], expected).max() < 0.01
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
@@ -121,4 +120,4 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
 def test_methods_that_see_no_capture_stay_as_they_are() -> None:
     observations, lights = pixels(20)
     for method in (estimator(), make_estimator("ls")):
-        assert for_capture(method, light_of(observations, lights), 20) is method
+        assert method.bind(light_of(observations, lights), 20) is method

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from splinecli.lights.lamp_light import LampLight
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import Estimator, MethodOptions, make_estimator, method_names
-from splinecli.methods.estimator import for_capture
 
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
@@ -68,7 +67,7 @@ def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) ->
     _, lights, observations = glossy_pixels
     some = observations[:6].astype(np.float32)
     turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
-    method = for_capture(make(name), lambda rows: LampLight(some[rows], turned[rows]), len(some))
+    method = make(name).bind(lambda rows: LampLight(some[rows], turned[rows]), len(some))
     together = method.estimate(some, turned)
     pairs = [method.estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
     assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05

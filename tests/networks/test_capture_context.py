@@ -40,15 +40,15 @@ def test_at_first_a_capture_says_nothing() -> None:
 
 def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> None:
     observations, lights = pixels(20)
-    context = network.look_at(observations, lights)
+    context = network.encode_context(observations, lights)
     whole = network(observations, lights)
     parts = [network(part, lights, context=context) for part in observations.split(7)]
     torch.testing.assert_close(torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0)
     torch.testing.assert_close(torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0)
     # It does say something, and the order of the sample does not matter.
-    other = network(observations, lights, context=network.look_at(*pixels(20, 5)))
+    other = network(observations, lights, context=network.encode_context(*pixels(20, 5)))
     assert (other.normals - whole.normals).abs().max() > 1e-3
-    shuffled = network.look_at(observations.flip(0), lights)
+    shuffled = network.encode_context(observations.flip(0), lights)
     again = network(observations, lights, context=shuffled)
     torch.testing.assert_close(again.normals, whole.normals, atol=3e-5, rtol=0)
 
@@ -106,4 +106,4 @@ def test_a_network_without_a_set_branch_sees_no_capture() -> None:
     with pytest.raises(ModelError, match="'sees_capture' needs 'set_width'"):
         NetworkConfig.from_dict({"sees_capture": True})
     observations, lights = pixels(3)
-    assert random_network(**SEES).look_at(observations, lights) is None
+    assert random_network(**SEES).encode_context(observations, lights) is None

@@ -11,9 +11,9 @@ from splinecli.pictures.maps import (
     albedo_picture,
     colour_errors,
     encode_png,
-    error_map_picture,
     preview_picture,
 )
+from splinecli.pictures.plots import error_map_picture
 
 
 def test_white_is_the_brightest_hundredth_of_the_mask():

@@ -14,8 +14,7 @@ from kills import content, killed_at
 from small_pixel_sets import MakeSet, matte_pixels
 from splinecli.errors import InputError, OutputError
 from splinecli.pictures.maps import contact_sheet
-from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, open_pixel_set
-from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSetWriter, open_pixel_set
 from splinecli.system.publishing import held_folder
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}

@@ -12,7 +12,6 @@ from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.lights.lamp_light import LampLight
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.estimator import refiner_of
 from splinecli.refinement.refiner import MARGIN, TILE, NetworkRefiner
 
 SIZE = 48
@@ -141,7 +140,7 @@ def test_seams_of_tiles_do_not_show() -> None:
     noise = np.random.default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
     before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
     errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
-    network = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32"))).network
+    network = make_estimator("spline-net", MethodOptions(precision="float32")).refiner.network
     found = []
 
     def light_of(chosen: Any) -> LampLight:

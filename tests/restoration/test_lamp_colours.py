@@ -8,7 +8,7 @@ from scenes import shade, sphere, spiral_lights, write_capture
 from splinecli.capture.reader import capture_from_arrays, open_capture
 from splinecli.fits.robust import fit_scaled_normals
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.results.files import albedo_map
+from splinecli.results.maps import albedo_map
 
 LIGHTS = spiral_lights(10, 50, 15)
 SOFT = np.tile([(1.5, 0.8, 0.7), (0.7, 1.5, 0.8), (0.8, 0.7, 1.5), (1, 1, 1), (1.3, 1.3, 0.4)], (2, 1))

@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.scenes import shade, sphere_cap, spiral_lights
 
+from splinecli.capture.reader import capture_from_arrays
 from splinecli.restoration.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
 
 Images = NDArray[np.float32]
@@ -60,9 +62,12 @@ def test_fine_texture_stays_as_it_is() -> None:
     assert removed(images)[1] is None
 
 
-def test_images_without_edges_stay_as_they_are() -> None:
-    ramp = np.broadcast_to(np.linspace(0.2, 0.8, SIDE, dtype=np.float32), (8, SIDE, SIDE)).copy()
-    assert removed(np.full_like(ramp, 0.5))[1] is None
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+def test_images_without_edges_stay_as_they_are(gloss: float) -> None:
+    """Shading alone looks like the widest blur."""
+    shading = shade(sphere_cap(SIDE), spiral_lights(8, 60), gloss=gloss)
+    assert removed(np.moveaxis(shading, 2, 0).astype(np.float32))[1] is None
+    assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
 
 
 def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
@@ -92,3 +97,24 @@ def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
     other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()
     remove_blur(other, mask, around)
     np.testing.assert_array_equal(part, other)
+
+
+def test_values_outside_the_mask_may_be_no_light() -> None:
+    images = blurred(discs(), 0.7)
+    mask = np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE // 2)) < SIDE / 3
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    images[3, ~mask] = np.nan
+    images[4, ~mask] = -1
+    capture = capture_from_arrays(images, lights, mask, light_intensities=np.ones(8))
+    assert capture.observations.shape == (mask.sum(), 8)
+    assert np.isfinite(capture.observations).all() and capture.observations.min() >= 0
+
+
+def test_stored_values_stay_as_they_are() -> None:
+    images = blurred(discs(), 0.7)
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    capture = capture_from_arrays(images, lights, light_intensities=np.ones(8), as_stored=True)
+    assert capture.removed_blur is None
+    np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
+    sharpened = capture_from_arrays(images, lights, light_intensities=np.ones(8))
+    np.testing.assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)

@@ -24,8 +24,8 @@ def lights_are(page: Any, x: float, y: float, note: str) -> None:
 def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
-    maps = {"confidence_map": mask.astype(np.float32), "error_map_deg": np.where(mask, np.float32(3), np.nan)}
-    html = result_page(report, normals, mask, albedo=normals + 1, **maps)
+    values = {"albedo": normals + 1, "confidence": mask.astype(np.float32)}
+    html = result_page(report, normals, mask, values=values, error_map_deg=np.where(mask, np.float32(3), np.nan))
     page = open_page(html, width=400, height=800, webgl=webgl)
     page.evaluate("splinecli.ready")
     canvas = page.locator("#view")

@@ -9,9 +9,9 @@ import numpy as np
 import tifffile
 
 from browser import OpenPage
-from splinecli.capture.files import NORMALS
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
+from splinecli.output_files import NORMALS
 from splinecli.results.pages import Entry, Row, index_page
 
 RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)

@@ -8,8 +8,7 @@ import torch
 
 from distributions import SHARE, N, assert_uniform, generator
 from splinecli.maths.observation_map import cell_directions, dot
-from splinecli.synthesis.effects import Wall, draw_ambient, draw_wall
-from splinecli.synthesis.pixels import draw_visible_normals
+from splinecli.synthesis.pixels import Wall, draw_ambient, draw_visible_normals, draw_wall
 from splinecli.synthesis.principled import PrincipledMaterial
 
 

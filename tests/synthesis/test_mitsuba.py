@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.synthesis.fields import moved, smooth_cut, smooth_union, torus, triangulate
-from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
+from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame, moved, smooth_cut, smooth_union, torus, triangulate
 from splinecli.synthesis.scenes import RenderedScene, Scene, SceneConfig, draw_scene, render_scene
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")

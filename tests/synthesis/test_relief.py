@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splinecli.errors import InputError
-from splinecli.synthesis.relief import Relief, draw_relief, read_relief
+from splinecli.synthesis.shapes import Relief, draw_detail, read_relief
 
 SIDE = 64
 ALONG, DOWN = np.meshgrid((np.arange(SIDE) + 0.5) / SIDE, (np.arange(SIDE) + 0.5) / SIDE)
@@ -50,7 +50,7 @@ def test_no_normal_turns_away_from_the_camera() -> None:
     normals = rng.normal(size=(4000, 3)).astype(np.float32)
     normals[:, 2] = np.abs(normals[:, 2])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    relief = draw_relief(6 * HEIGHT_SLOPES, 128, np.random.default_rng(3))
+    relief = draw_detail(6 * HEIGHT_SLOPES, 128, np.random.default_rng(3))
     bent = relief.bend(normals, rng.uniform(-1, 1, (4000, 3)).astype(np.float32))
     np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
     assert (bent[:, 2] >= np.minimum(normals[:, 2], 0.1) - 1e-3).all()

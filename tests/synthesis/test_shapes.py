@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splinecli.synthesis import fields
+from splinecli.synthesis import meshes
 from splinecli.synthesis.meshes import REACH, Floats
 from splinecli.synthesis.shapes import KINDS, draw_shape_of_kind
 from synthesis.test_meshes import outward_volume
@@ -18,38 +18,38 @@ def points(count: int = 2000, seed: int = 0) -> Floats:
 @pytest.mark.parametrize(
     "field",
     [
-        fields.ellipsoid(np.full(3, 0.5, np.float32)),
-        fields.box(np.array((0.5, 0.3, 0.7), np.float32), 0.1),
-        fields.torus(0.5, 0.2),
-        fields.capsule(0.4, 0.2),
+        meshes.ellipsoid(np.full(3, 0.5, np.float32)),
+        meshes.box(np.array((0.5, 0.3, 0.7), np.float32), 0.1),
+        meshes.torus(0.5, 0.2),
+        meshes.capsule(0.4, 0.2),
     ],
 )
-def test_solids_are_true_distances(field: fields.Field) -> None:
+def test_solids_are_true_distances(field: meshes.Field) -> None:
     at = points()
-    slope = np.linalg.norm(fields.gradient(field, at), axis=1)
+    slope = np.linalg.norm(meshes.gradient(field, at), axis=1)
     # But on the creases of the box's inside and on axes, which few points are near, distance grows at unit rate.
     assert np.abs(slope - 1).mean() < 0.01
     # And a step along it by the distance meets the surface.
-    foot = at - field(at)[:, None] * fields.gradient(field, at)
+    foot = at - field(at)[:, None] * meshes.gradient(field, at)
     outside = field(at) > 0.01
     assert np.abs(field(foot))[outside].max() < 2e-3
 
 
 def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
     first, second = points(seed=1)[:, 0], points(seed=2)[:, 0]
-    union = fields.smooth_union(first, second, 0.1)
+    union = meshes.smooth_union(first, second, 0.1)
     apart = np.abs(first - second) > 0.1
     np.testing.assert_array_equal(union[apart], np.minimum(first, second)[apart])
     below = np.minimum(first, second) - union
     assert below.min() >= -1e-7
     assert below.max() == pytest.approx(0.025, abs=1e-3)  # a quarter of the blend, where both are alike
-    cut, apart = fields.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
+    cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
     np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
 
 
 def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
-    mesh = fields.triangulate(fields.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
-    assert np.abs(fields.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
+    mesh = meshes.triangulate(meshes.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
+    assert np.abs(meshes.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
     ring = mesh.vertices * (1, 1, 0)
     centre = 0.6 * ring / np.linalg.norm(ring, axis=1, keepdims=True)
     expected = (mesh.vertices - centre) / 0.25
@@ -64,20 +64,20 @@ def test_crumbs_and_the_empty_field_are_dropped() -> None:
         small = np.linalg.norm(at - np.float32(0.8), axis=1) - np.float32(0.1)
         return np.minimum(large, small)
 
-    mesh = fields.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
+    mesh = meshes.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.51
-    assert fields.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
+    assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
 
 def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = fields.waves(np.random.default_rng(0), 1.0)
+    noise = meshes.waves(np.random.default_rng(0), 1.0)
 
     def lumps(at: Floats) -> Floats:
         return np.linalg.norm(at, axis=1) - np.float32(0.6) - np.float32(0.05) * noise(at)
 
-    sparse = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
-    monkeypatch.setattr(fields, "COARSE", 1)
-    dense = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    sparse = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    monkeypatch.setattr(meshes, "COARSE", 1)
+    dense = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     assert len(sparse.faces) == len(dense.faces)
     np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
 

@@ -7,9 +7,9 @@ import torch
 
 from splinecli.errors import ModelError
 from splinecli.networks.weights import save_weights
-from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import TrainingConfig
 from splinecli.training.loop import CHECKPOINT, Trainer
+from splinecli.training.run_files import read_checkpoint_config
 
 CPU = torch.device("cpu")
 pytestmark = pytest.mark.usefixtures("no_pictures")

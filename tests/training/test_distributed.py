@@ -16,7 +16,7 @@ from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import METRICS
 from splinecli.training.distributed import Workers, is_launched, join_workers, restarts_are_allowed
 from splinecli.training.loop import WEIGHTS, Trainer
-from splinecli.training.run_log import read_metrics
+from splinecli.training.run_files import read_metrics
 
 CPU = torch.device("cpu")
 STEPS = 6
@@ -103,7 +103,7 @@ FAILING = """
 import os, signal
 from splinecli.__main__ import run
 from splinecli.training import loop, tasks
-from splinecli.training.run_log import RunLog
+from splinecli.training.run_files import RunLog
 loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, tasks.VALIDATION_PIXELS = 0.05, 5, 16
 RunLog.draw = lambda self, maps: None
 step = loop.Trainer.step

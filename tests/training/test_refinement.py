@@ -11,8 +11,7 @@ from splinecli.errors import ModelError, UsageError
 from splinecli.networks.refine_net import CHANNELS
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights, resolve_weights, save_weights
-from splinecli.pixel_sets.store import Pixels, PixelSet
-from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.whole_capture import photograph_scene
 from splinecli.training import refinement, tasks

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from scenes import decode_rgb
-from splinecli.capture.files import CURVES, TRAINING_MAPS
+from splinecli.output_files import CURVES, TRAINING_MAPS
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.loop import Trainer
-from splinecli.training.run_log import Metrics, RunLog, read_metrics
+from splinecli.training.run_files import Metrics, RunLog, read_metrics
 
 ROWS = [
     Metrics(50, 800, 0.1, 1e-3, 2.0, 20.0, 0.2, 0.1),

@@ -13,7 +13,7 @@ from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.sources import PixelSource, open_sets, pixel_source, split_scenes
+from splinecli.training.tasks import PixelSource, open_sets, pixel_source, split_scenes
 
 
 def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, PixelSource]:

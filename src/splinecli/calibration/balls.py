@@ -17,7 +17,15 @@ import cv2
 import numpy as np
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
-from splinecli.capture.files import MASK, NOT_PHOTOGRAPHS, find_images, find_named, list_images
+from splinecli.capture.files import (
+    MASK,
+    NOT_PHOTOGRAPHS,
+    choose_mask,
+    find_images,
+    find_named,
+    is_mask_name,
+    list_images,
+)
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
 from splinecli.capture.near_lamps import read_camera_matrix
@@ -32,8 +40,6 @@ DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: al
 SHORTEST_LENS = 0.7
 """Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
 
-EXIF_ERROR = 0.05
-"""Standard deviation of a focal length in EXIF, as a share: numbers are rounded, and focusing changes it."""
 
 _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
 _MILLIMETRES = {2: 25.4, 3: 10.0}
@@ -60,7 +66,8 @@ class View:
             nearest = self.shortest / float(self.matrix[0, 0])
             factor = nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
-            factor = math.exp(EXIF_ERROR * generator.normal())
+            # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing changes them.
+            factor = math.exp(0.05 * generator.normal())
         matrix = self.matrix.copy()
         matrix[:2, :2] *= factor
         return matrix
@@ -100,8 +107,6 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
 
 
 HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
-MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
-_MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed ball, not a lamp
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     # The blur removes bright single pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    if brightest <= MIN_CONTRAST * median or brightest <= 0:
+    if brightest <= 4.0 * median or brightest <= 0:  # smallest ratio of the highlight to the median of the ball
         raise InputError(
             "found no highlight in the ball",
             hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
@@ -141,7 +146,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     core = labels == light.argmax()
     y, x = np.nonzero(core)
     width = max(np.ptp(x), np.ptp(y))
-    if width > _MAX_WIDTH * 2 * circle.radius:
+    if width > 0.3 * 2 * circle.radius:  # a wider patch is a window or an overexposed ball, not a lamp
         problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
         raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
@@ -239,10 +244,12 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
 
     A mask that is given replaces the one in the folder. Raises InputError where there are no images.
     """
-    images, _ = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
+    images, listed = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
+    if not listed and 2 * sum(map(is_mask_name, images)) < len(images):  # such as chrome.mask.tga
+        images = tuple(image for image in images if not is_mask_name(image))
     others = list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
-    return BallFiles(folder, images, reference, mask or find_named(folder, MASK))
+    return BallFiles(folder, images, reference, mask or find_named(folder, MASK) or choose_mask(folder, images)[0])
 
 
 def calibrate_ball(

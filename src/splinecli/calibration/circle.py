@@ -17,12 +17,8 @@ RAYS = 720
 _ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
 _RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
 MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
-_SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
 _TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it
-_MIN_EDGE = 0.01  # weakest edge that counts
-_N_CIRCLES = 12  # circles of the Hough transform that are refined
-_N_SAMPLES = 300  # random triples of points
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,7 @@ def find_circle(image: Array) -> Circle:
     values = image.astype(np.float32)
     # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
     values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
-    scale = _SEARCH_SIZE / max(values.shape)
+    scale = 480 / max(values.shape)  # the Hough transform searches an image of this longer side
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=interpolation)
     small = cv2.GaussianBlur(small, (0, 0), 1.5)
@@ -109,7 +105,8 @@ def find_circle(image: Array) -> Circle:
             minRadius=round(0.08 * max(small.shape)),
             maxRadius=round(0.55 * max(small.shape)),
         )
-        for x, y, radius in found[0, :_N_CIRCLES].tolist() if found is not None else ():
+        # The best circles of the Hough transform are refined.
+        for x, y, radius in found[0, :12].tolist() if found is not None else ():
             # Pixel centres are at whole numbers in both images, so their corners differ by half a pixel.
             guess = Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
             circle = _refine(values, guess)
@@ -145,7 +142,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
         # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
-        clear = strength > _MIN_EDGE
+        clear = strength > 0.01  # weakest edge that counts
         if clear.sum() < 0.2 * RAYS:
             return None
         points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
@@ -163,7 +160,7 @@ def _fit(points: Doubles, *, outline_points: int) -> Circle:
     generator, size = np.random.default_rng(0), np.ptp(points, axis=0).max()
     best: tuple[float, float, float] | None = None
     most = -1
-    for _ in range(_N_SAMPLES):
+    for _ in range(300):  # random triples of points
         circle = _through(points[generator.choice(len(points), 3, replace=False)])
         if circle is None or not 0.2 * size < circle[2] < 3 * size:
             continue

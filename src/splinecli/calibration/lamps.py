@@ -31,7 +31,6 @@ SMALLEST_COSINE = 0.35
 """Only pixels with n.l above this are used. Closer to grazing light, a matte ball is seldom Lambertian."""
 
 _MIN_PIXELS, _MOST_PIXELS = 50, 1 << 16
-_USED_RADIUS = 0.97  # of a ball: pixels at the rim mix it with the background
 
 
 def measure_light_intensities(
@@ -99,14 +98,11 @@ def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) ->
     if files.mask is None:
         raise InputError("the images of the gray ball need a mask", path=files.folder, hint="Add one as mask.png")
     circle = circle_from_mask(mask)
-    mask &= Circle(circle.x, circle.y, _USED_RADIUS * circle.radius).inside(shape)
+    # Pixels at the rim mix the ball with the background.
+    mask &= Circle(circle.x, circle.y, 0.97 * circle.radius).inside(shape)
     y, x = np.nonzero(mask)
     return mask, circle.normals(x.astype(np.float64), y.astype(np.float64))
 
-
-LARGEST_UNCERTAINTY = 0.4
-"""Largest uncertainty of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel, and the
-lamp may be at any distance."""
 
 PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
@@ -129,7 +125,8 @@ class LampPositions:
     @property
     def known(self) -> bool:
         """Whether every lamp has a position in front of the balls that the rays determine well."""
-        most = LARGEST_UNCERTAINTY * np.linalg.norm(self.positions, axis=1)
+        # With a larger uncertainty the rays are nearly parallel, and the lamp may be at any distance.
+        most = 0.4 * np.linalg.norm(self.positions, axis=1)
         return bool((self.positions[:, 2] > 0).all() and (self.uncertainty <= most).all())
 
 
@@ -213,14 +210,6 @@ def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float
         weights = np.maximum(np.linalg.norm(nearest - starts, axis=2), 1e-12) ** -2.0
     points[usable] = nearest
     return points, float((weights * np.square(misses).sum(axis=2)).mean()) if usable.any() else math.nan
-
-
-UNSURE_VISIBLE = 0.6  # smallest visible share of an outline without a warning
-UNSURE_SPREAD = 0.01  # largest spread of an outline without a warning, as a share of the radius
-DISAGREEMENT_DEG = 5.0  # largest angle between a ball and the mean of all balls without a warning
-
-MISTAKEN_DEG = 3.0
-"""Smallest mean difference at which compared directions are checked for a mistaken frame."""
 
 
 def calibration_report(
@@ -310,7 +299,8 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
         f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
         " --circle."
         for ball in lights.balls
-        if ball.circle.visible < UNSURE_VISIBLE or ball.circle.spread > UNSURE_SPREAD * ball.circle.radius
+        # Less of the outline is visible, or it varies by more than 1 % of the radius.
+        if ball.circle.visible < 0.6 or ball.circle.spread > 0.01 * ball.circle.radius
     ]
     if lamps is not None and not lamps.known:
         warnings.append(
@@ -322,7 +312,8 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
         )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]
-    if largest > DISAGREEMENT_DEG and not (lamps is not None and lamps.known):
+    # Exact balls differ from their mean by less.
+    if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
             f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."
             f" Check {picture}."
@@ -330,7 +321,8 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
         from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
-        if difference > MISTAKEN_DEG and from_normals < difference / 3:
+        # Smaller differences are no mistaken frame.
+        if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of the light directions:"
                 " each lies half-way between the view and the light. Use the file written here."

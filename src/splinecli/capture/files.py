@@ -1,5 +1,4 @@
-"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are; and the
-names of all files that splinecli writes for people, which are no photographs."""
+"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are."""
 
 from __future__ import annotations
 
@@ -8,77 +7,31 @@ import json
 import os.path
 import re
 import stat
+from collections import Counter
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.formats.decoders import RAW_SUFFIXES
+from splinecli.capture.formats.decoders import RAW_SUFFIXES, page_of, pages
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
+from splinecli.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.output_files import FOUND_LIGHTS, PLOTS, own_files
+from splinecli.output_files import MAPS as MAPS
+from splinecli.output_files import NORMALS as NORMALS
+from splinecli.output_files import SCALED_MAPS as SCALED_MAPS
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
-
-NORMALS = {
-    "png": "normals.png",
-    "png8": "normals_8bit.png",
-    "npy": "normals.npy",
-    "tiff": "normals.tiff",
-    "exr": "normals.exr",
-}
-"""The file of the normal map in each format."""
-
-ERROR_MAP = "error_map.png"
-REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
-CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
-FOUND_LIGHTS = FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = (
-    "light_directions.txt",
-    "light_intensities.txt",
-    "lights.png",
-)
-"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
-
-GRADIENT, GRADIENT_TIFF = "gradient.npy", "gradient.tiff"
-CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF = "curvature.png", "curvature.npy", "curvature.tiff"
-RELIEF_PICTURE, RELIEF, RELIEF_TIFF = "relief.png", "relief.npy", "relief.tiff"
-MAPS = {
-    "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
-    "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
-    "preview": (PREVIEW,),
-    "gradient": (GRADIENT, GRADIENT_TIFF),
-    "curvature": (CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF),
-    "relief": (RELIEF_PICTURE, RELIEF, RELIEF_TIFF),
-}
-"""The files of each optional map."""
-
-SCALED_MAPS = ("curvature", "relief")  # maps whose picture has a fixed scale, which the user may choose
-OWN_FILES = (
-    *NORMALS.values(),
-    ERROR_MAP,
-    *(name for names in MAPS.values() for name in names),
-    *file_names(tuple(SURFACE_FILES)),
-    SURFACE_REPORT,
-    FOUND_MASK,
-    PAGE,
-    REPORT,
-)
-"""All files that `infer` and `integrate` may write into a capture's folder of results, but FOUND_LIGHTS."""
-
-PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
-    "calibration.png",
-    "light_noise.png",
-    "contact_sheet.png",
-    "curves.png",
-    "maps.png",
-)
-"""Pictures that the other commands write."""
-
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # images only where a folder has no others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
-IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)  # suffixes of images of an object
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
+IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
 
 _DIGITS = re.compile(r"([0-9]+)")
 
@@ -113,9 +66,9 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
-    Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
-    replaces it. A JPEG is a copy that the camera made, and does not count. What is left out has another meaning, by its
-    stem in lower case, such as "mask", or as a file that the user named.
+    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is a
+    copy that the camera or a viewer made, and does not count. What is left out has another meaning, by its stem in
+    lower case, such as "mask", or as a file that the user named.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -126,21 +79,43 @@ def list_images(
         and is_found_file(entry)
         and resolve(entry) not in others
     ]
-    names = [(image.stem.lower(), image.suffix.lower()) for image in images]
-    raw = {stem for stem, suffix in names if suffix in RAW_SUFFIXES}
-    developed = {stem for stem, suffix in names if suffix in _DEVELOPED}
-    return tuple(
-        image
-        for image, (stem, suffix) in zip(images, names, strict=True)
-        if stem not in raw or suffix in (_DEVELOPED if stem in developed else RAW_SUFFIXES)
-    )
+    images = [image for image in images if image.suffix.lower() not in _RARE] or images
+    best: dict[str, int] = {}
+    for image in images:
+        best[image.stem.lower()] = min(_rank(image), best.get(image.stem.lower(), len(_KINDS)))
+    return tuple(image for image in images if _rank(image) == best[image.stem.lower()])
+
+
+def _rank(image: Path) -> int:
+    return next(rank for rank, suffixes in enumerate(_KINDS) if image.suffix.lower() in suffixes)
+
+
+def copies(images: Sequence[Path]) -> list[CaptureWarning]:
+    """Say which images were left out because another file of the same stem shows the same photograph."""
+    images = [page_of(image)[0] for image in images]
+    stems = {image.stem.lower() for image in images}
+    others = [
+        entry
+        for folder in {image.parent for image in images}
+        for entry in list_folder(folder)
+        if entry.suffix.lower() in IMAGE_SUFFIXES and entry.stem.lower() in stems and entry not in images
+    ]
+    if not others:
+        return []
+    kinds, used = (", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images))
+    text = f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the same photographs, and"
+    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} are left out.")]
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
+        suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
+        found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
         raise NoImagesError(
-            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images"
+            "the folder contains no images" + (f", but {found}" if found else ""),
+            path=folder,
+            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images",
         )
 
 
@@ -154,11 +129,12 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         name = text.strip()
         if not name:
             continue
-        image = path.parent / name
+        places = (path.parent / each / name for each in ("", *IMAGE_FOLDERS))
+        image = next(filter(os.path.exists, places), None)  # Path.exists raises for a name that is too long
         if Path(name).is_absolute() or ".." in Path(name).parts:
             hint = "Copy the image into the folder, or set a link to it there, and name that"
             raise InputError(f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint)
-        if not os.path.exists(image):  # noqa: PTH110 - Path.exists raises for a name that is too long
+        if image is None:
             hint = "Correct the name or remove the line"
             raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
         check_file(image, "an image")
@@ -182,27 +158,28 @@ def find_images(
         return read_image_list(filenames), True
     images = list_images(folder, leave_out_stems=leave_out_stems, leave_out=leave_out)
     check_not_empty(images, folder)
+    if len(images) == 1 and images[0].suffix.lower() in (".tif", ".tiff"):
+        images = tuple(pages(images[0]))
     return images, False
 
 
 FILENAMES = "filenames.txt"
-LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
-_NAMED_LIGHTS = (".lp", "lights.json")  # endings of the names of light files that name the image of each light
 LIGHT_POSITIONS = ("light_positions.txt",)
-LIGHT_FILES = "light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt"
-"""The usual names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
     f"{stem}{suffix}"
-    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt")
+    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt", ".bmp")
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
+IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
+"""Names of folders that contain the images of the capture that is the folder around them; the first is PSBox's."""
+
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
-    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *OWN_FILES, *FOUND_LIGHTS, *PLOTS)
+    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
     if Path(name).suffix in IMAGE_SUFFIXES
 )
 """Lower-case stems of pictures in a capture's folder that are not images of the object under one light. The folder of
@@ -225,6 +202,8 @@ class CaptureFiles:
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
     others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
+    kept: tuple[int, ...] | None = None  # zero-based places in the light file of the images; None for all
+    warnings: tuple[CaptureWarning, ...] = ()  # what was chosen among files whose names are not the usual ones
 
 
 @dataclass(frozen=True)
@@ -257,16 +236,43 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     return next((files[name] for name in names if name in files and is_found_file(files[name])), None)
 
 
-def find_lights(folder: Path) -> Path | None:
-    """Return the light file in the folder; None for none. Raises InputError for several that name their images."""
-    plain = find_named(folder, LIGHT_DIRECTIONS)
-    if plain is not None:
-        return plain
-    named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
-    if len(named) > 1:
-        problem = f"found {len(named)} light files: {', '.join(path.name for path in named)}"
-        raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
-    return named[0] if named else find_named(folder, LIGHT_POSITIONS)
+_MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
+
+
+def is_mask_name(path: Path) -> bool:
+    """Return whether a picture's name has the word "mask", as NAME_mask.png and chrome.mask.tga, but is no result."""
+    stem = path.stem.lower()
+    is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
+    return is_picture and _MASK_WORD.search(stem) is not None
+
+
+def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
+    """Return the mask of photographs that have none with a usual name, and a warning that says which; None for none.
+
+    It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
+    name; or else the alpha channel of the first photograph. Of several pictures, none is chosen.
+    """
+    name, of_images = folder_name(folder).lower(), images[0].parent
+    entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
+    with suppress(InputError):  # what is beside a folder is not always ours to read
+        around = list_folder(folder.absolute().parent)
+        entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
+    named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
+    try:
+        size = read_facts(images[0]).size[0] if named else ()
+        masks = [path for path in named if read_facts(path).size[0][:2] == size[:2]]
+        if not named and read_facts(images[0]).stated_channels in (2, 4):
+            masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
+    except InputError:  # reading the images names the damage
+        return None, ()
+    if not masks:
+        return None, ()
+    text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
+    if masks[0] in images:
+        text = f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for another one."
+    if len(masks) > 1:
+        text = f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with --mask FILE."
+    return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 
 
 def folder_name(folder: Path) -> str:
@@ -310,6 +316,7 @@ def digest(stamp: Sequence[Any]) -> str:
 
 
 def _path_size_and_time(path: Path) -> tuple[str, int, int]:
+    stored, page = page_of(path)
     with reading(path):
-        status = path.stat()
-        return str(path.resolve()), status.st_size, status.st_mtime_ns
+        status = stored.stat()
+        return str(stored.resolve()) + f"[{page}]" * (page > 0), status.st_size, status.st_mtime_ns

@@ -7,13 +7,13 @@ for each line of the object's light.txt: 00000.tif and so on. A capture is one s
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture.files import (
     FILENAMES,
     GROUND_TRUTH,
-    LIGHT_DIRECTIONS,
-    LIGHT_FILES,
+    IMAGE_FOLDERS,
     LIGHT_INTENSITIES,
     MASK,
     NO_OVERRIDES,
@@ -22,15 +22,18 @@ from splinecli.capture.files import (
     NoImagesError,
     Overrides,
     check_not_empty,
+    choose_mask,
+    copies,
     find_images,
-    find_lights,
     find_named,
     folder_name,
+    is_mask_name,
     list_folder,
     list_images,
 )
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.light_files import read_light_directions
+from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
 
@@ -42,6 +45,7 @@ _BOUNDARIES = ("inboundary.png", "onboundary.png")
 _MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
 # Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
 _ENOUGH_MARKS = 2
+_USUAL_LIGHTS = [name for each in FORMATS if not each.rank for name in each.found]
 _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
@@ -91,7 +95,7 @@ def cyclesps_name(folder: Path) -> str | None:
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
     is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
-    if not (is_images_folder or _has_marks(folder)) or find_named(folder, LIGHT_DIRECTIONS) is not None:
+    if not (is_images_folder or _has_marks(folder)) or find_named(folder, _USUAL_LIGHTS) is not None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
@@ -143,11 +147,17 @@ _WORD = re.compile(r"[a-z]+")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 """Words in the names of pictures that other programs leave beside the photographs."""
 
+_RESULT_WORDS = frozenset({"demo", "result", "results"})
+"""The same, where no light file says how many photographs there are."""
+
 _MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
 
 
-PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
-"""The names of the light file and of the folder of images, in the layout of PSBox (Y. Xiong)."""
+PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+
+
+def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
+    return not words.isdisjoint(_WORD.findall(image.stem.lower()))
 
 
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
@@ -173,7 +183,21 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 def capture_name(folder: StrPath) -> str:
     """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
-    return folder.stem if is_film(folder) else cyclesps_name(folder) or folder_name(folder)
+    return folder.stem if is_film(folder) else cyclesps_name(folder) or _own_name(folder)
+
+
+def _own_name(folder: Path) -> str:
+    """Return the name of a folder, of a folder `images` that of the folder around it. Raises InputError."""
+    name = folder_name(folder)
+    return folder_name(_parent(folder)) if name in IMAGE_FOLDERS and _parent(folder) != folder else name
+
+
+def _images_folder(folder: Path) -> Path | None:
+    """Return the folder of images of a capture without images of its own; None for none."""
+    inside = next((path for name in IMAGE_FOLDERS if is_folder(path := folder / name)), None)
+    if inside is None or not all(map(_is_other, list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS))):
+        return None
+    return inside if list_images(inside, leave_out_stems=NOT_PHOTOGRAPHS) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -193,7 +217,7 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    problem = f"found no capture, expected folders of images with a light file ({LIGHT_FILES})"
+    problem = f"found no capture, expected folders of images with a light file ({light_names()})"
     hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
     raise InputError(problem, path=folder, hint=hint)
 
@@ -205,10 +229,12 @@ def _subfolders(folder: Path) -> list[Path]:
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
-        objects = folder / PSBOX_IMAGES
+        objects = folder / IMAGE_FOLDERS[0]
         is_psbox = is_folder(objects) and find_named(folder, PSBOX_LIGHTS) is not None
-        if find_named(folder, [FILENAMES]) is not None or list_images(
-            objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
+        if (
+            find_named(folder, [FILENAMES]) is not None
+            or list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS)
+            or _images_folder(folder) is not None
         ):
             return [folder]
     return list_cyclesps(folder) or []
@@ -229,30 +255,37 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
-    images, listed = find_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
+    listed = find_named(folder, [FILENAMES]) is not None
+    of_images = folder if listed else _images_folder(folder) or folder
+    images, _ = find_images(of_images, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | _RESULT_WORDS
+    others = tuple(image for image in images if _is_other(image, words))
     if listed or len(others) > _MOST_OTHERS * len(images):
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
+        option = light_option([folder, _parent(folder)], len(images))
         raise InputError(
-            f"the folder contains {len(images)} images but no light file ({LIGHT_FILES})",
+            f"the folder contains {len(images)} images but no light file ({light_names()})",
             path=folder,
-            hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
+            hint=f"Add {option}"
+            if option
+            else "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
     layout, ground_truth = "plain folder", GROUND_TRUTH
     if listed and find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    return _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    files = _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    return files if listed else replace(files, warnings=(*files.warnings, *copies(images)))
 
 
 def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
     lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
-    objects = folder / PSBOX_IMAGES
+    objects = folder / IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
     images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
@@ -273,14 +306,19 @@ def _gather(
 
     Files that the user names come before those of the folder.
     """
+    mask, warnings = overrides.mask or find_named(folder, MASK), tuple[CaptureWarning, ...]()
+    if mask is None:
+        mask, warnings = choose_mask(folder, images)
+        others = tuple(path for path in others if not warnings or not is_mask_name(path))
     return CaptureFiles(
         layout,
-        folder_name(folder),
+        _own_name(folder),
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
+        mask=mask,
         ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
         others=others,
+        warnings=warnings,
     )

@@ -1,36 +1,32 @@
-"""Light directions and intensities from files: N x 3 or 3 x N, with or without a count line, or with names of images.
+"""Light files: the table of their formats, light directions and intensities, and lights that name their images.
 
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 
-Light files that name the image of each light: RTI's .lp, the JSON of AliceVision (Meshroom), and text. The names often
-come from another machine, with folders that do not exist here, or are only numbers. So the images of the folder are
-matched to them by base name, then by name without suffix, then by order.
+The names in a file often come from another machine, with folders that do not exist here, or are only numbers. So the
+images of the folder are matched to them by base name, then by name without suffix, then by order.
 """
 
 import io
-import json
-import reprlib
-import sys
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from splinecli.capture import light_formats
+from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
 from splinecli.capture.formats.numbers import (
     DECIMAL_POINT,
+    MOST_TEXT,
     NumberRows,
     columns,
     has_decimal_commas,
-    parse_number,
-    read_lines,
     read_number_rows,
-    split_words,
-    uses_decimal_commas,
 )
 from splinecli.capture.light_rows import (
-    ARRAY_SUFFIXES,
     COLUMNS,
     USUAL_FRAME,
     LightFrame,
@@ -38,24 +34,129 @@ from splinecli.capture.light_rows import (
     check_angles,
     counts_rows,
     directions_from_angles,
-    image_name,
-    read_array_file,
     read_light_rows,
     refuse_angles,
 )
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Doubles
 from splinecli.maths.normals import unit
-from splinecli.system.files import StrPath, parse_json
+from splinecli.system.files import StrPath, is_found_file
+
+_FILE = "a text file with a line {} for each image"
+
+
+def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    meaning = COLUMNS[form]
+    return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+
+
+def _encode_text(directions: Doubles, images: Sequence[Path]) -> bytes:
+    return rows_text(directions).encode()
+
+
+def _encode_lp(directions: Doubles, images: Sequence[Path]) -> bytes:
+    rows = zip(images, rows_text(directions).splitlines(), strict=True)
+    text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
+    return text.encode(errors="surrogateescape")
+
+
+def _encode_npy(directions: Doubles, images: Sequence[Path]) -> bytes:
+    np.save(file := io.BytesIO(), directions)
+    return file.getvalue()
+
+
+@dataclass(frozen=True)
+class LightFormat:
+    """A format of light files. To add one, write its reader and a row of FORMATS."""
+
+    name: str  # for people
+    suffixes: tuple[str, ...]  # in lower case; none for the format of all files with a suffix that no other row has
+    read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
+    found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
+    rank: int = 0  # files of a lower rank are found first. In rank 0, names count in order; in others, two are an error
+    recognise: Callable[[Path], bool] = Path.exists  # says by content which of the formats of one suffix a file has
+    encode: Callable[[Doubles, Sequence[Path]], bytes] | None = None  # directions (F, 3) of images; None if only read
+
+
+FORMATS = (
+    LightFormat("text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text),
+    LightFormat(
+        "NumPy", (".npy",), light_formats.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy
+    ),
+    LightFormat("RTI", (".lp",), light_formats.read_lp, ("*.lp",), 1, encode=_encode_lp),
+    LightFormat("Relight", (".dome", ".json"), light_formats.read_dome, ("*.dome",), 2, light_formats.is_dome),
+    LightFormat(
+        "JSON list", (".json",), light_formats.read_json_list, ("light_directions.json",), 2, light_formats.is_list
+    ),
+    LightFormat("AliceVision", (".json",), light_formats.read_alicevision, ("*lights.json",), 1),
+    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
+    LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
+    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
+)
+"""All formats of light files. What they are called, how they are found, read and written follows from this table."""
+
+
+def format_of(path: Path) -> LightFormat:
+    """Return the format of a light file. Raises InputError for a damaged file of one that is known by its content."""
+    suffix = path.suffix.lower()
+    alike = [each for each in FORMATS if suffix in each.suffixes] or [FORMATS[0]]
+    return next((each for each in alike[:-1] if each.recognise(path)), alike[-1]) if len(alike) > 1 else alike[0]
+
+
+def light_names() -> str:
+    """Return the usual names of light files, for messages."""
+    return f"{', '.join(each.found[0] for each in FORMATS)} or {LIGHT_POSITIONS[0]}"
+
+
+def light_suffixes() -> str:
+    """Return the suffixes of light files, for help."""
+    return ", ".join(dict.fromkeys(("text", *(suffix for each in FORMATS for suffix in each.suffixes))))
+
+
+def find_lights(folder: Path) -> Path | None:
+    """Return the light file in the folder; None for none. Raises InputError for several where none is the usual one."""
+    entries = list_folder(folder)
+    for rank in sorted({each.rank for each in FORMATS}):
+        names = [name for each in FORMATS if each.rank == rank for name in each.found]
+        paths = [e for name in names for e in entries if fnmatchcase(e.name.lower(), name) and is_found_file(e)]
+        if rank and len(paths) > 1:
+            problem = f"found {len(paths)} light files: {', '.join(path.name for path in paths)}"
+            raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
+        if paths:
+            return paths[0]
+    return find_named(folder, LIGHT_POSITIONS)
+
+
+_SLANT_WORD, _NO_LIGHTS = re.compile("slant|tilt"), re.compile("intens|camera|filenames|lobes")
+_MOST_TRIED = 50  # files of a folder
+
+
+def light_option(folders: Sequence[Path], n_images: int) -> str | None:
+    """Return the options that read a file in one of the folders as lights; None for no such file."""
+    suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
+    for folder in folders:
+        with suppress(InputError, OSError):
+            entries = [e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)]
+            entries.sort(key=lambda e: "light" not in e.name.lower())
+            for path in entries[:_MOST_TRIED]:
+                name = path.name.lower()
+                if _NO_LIGHTS.search(name) or path.stat().st_size > MOST_TEXT:
+                    continue
+                angles: RowForm = "slant-tilt" if _SLANT_WORD.search(name) else "azel"
+                for form in ("xyz", angles):
+                    with suppress(InputError):
+                        read_lights(path, n_images, form=form)
+                        return f"--lights {path}" + (f" --light-format {form}" if form != "xyz" else "")
+    return None
+
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
-_FILE = "a text file with a line {} for each image"
 
 
 def read_light_directions(
     path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> Doubles:
-    """Return unit light directions (F, 3) float64 from a text file or an .npy file, in the order of the file.
+    """Return unit light directions (F, 3) float64 from a light file, in the order of the file.
 
     A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the columns in another
     order, and a first line with only the number of lights, are accepted (the University of Washington's lights.txt). If
@@ -75,11 +176,8 @@ def read_light_directions(
 
 
 def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Return the rows of a text file or of a file of matrices. Raises InputError; see read_light_directions."""
-    if path.suffix.lower() in ARRAY_SUFFIXES:
-        return read_array_file(path, n_images)
-    meaning = COLUMNS[form]
-    return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+    """Return the rows of a light file of any format. Raises InputError; see read_light_directions."""
+    return format_of(path).read(path, n_images, form)
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Doubles:
@@ -97,11 +195,16 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
     return positions
 
 
-def lights_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> tuple[Doubles, Doubles]:
-    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""
-    table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
-    if form == "xyz":
-        refuse_angles(table)
+def lights_of(
+    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm, *, leave_bad: bool = False
+) -> tuple[Doubles, Doubles]:
+    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length; see unit_directions."""
+    if table.are_vectors:
+        form = "positions" if form == "positions" else "xyz"
+    else:
+        table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+        if form == "xyz":
+            refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
     vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
     if form in ("azel", "slant-tilt"):
@@ -109,12 +212,25 @@ def lights_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: 
         vectors = directions_from_angles(vectors, form)
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
-    places = [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))]
-    return vectors, unit_directions(vectors, table.path, lines, places, lamps=form == "positions")
+    places = [
+        f" in column {light + 1}" if transposed else f" as light {light + 1}" if lines[light] is None else ""
+        for light in range(len(vectors))
+    ]
+    lamps = form == "positions"
+    return vectors, unit_directions(vectors, table.path, lines, places, lamps=lamps, leave_bad=leave_bad)
+
+
+_MOST_BAD = 0.1  # share of the lights that may be wrong in a file in the right frame
 
 
 def unit_directions(
-    vectors: Doubles, path: Path, lines: Sequence[int | None], places: Sequence[str], lamps: bool = False
+    vectors: Doubles,
+    path: Path,
+    lines: Sequence[int | None],
+    places: Sequence[str],
+    *,
+    lamps: bool = False,
+    leave_bad: bool = False,
 ) -> Doubles:
     """Return vectors (F, 3) at unit length.
 
@@ -122,6 +238,7 @@ def unit_directions(
         vectors: of any length.
         places: words for the place of each vector on its line.
         lamps: whether the vectors are positions of lamps, for messages.
+        leave_bad: return a few lights that are zero or below the horizon as they are (z <= 0), for the caller to drop.
 
     Raises:
         InputError: a zero vector, or a light that is not above the horizon.
@@ -130,6 +247,8 @@ def unit_directions(
     # First divide by the largest component, because squares of very large or small ones leave float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
+    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= _MOST_BAD * len(directions):
+        return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
@@ -216,7 +335,9 @@ def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_imag
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
-    problem = f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image"
+    count = len(readings[0][0])
+    what = {"light directions": "light direction", "lights": "light"}.get(what, what) if count == 1 else what
+    problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
     raise InputError(problem, path=table.path, hint=hint)
 
@@ -224,10 +345,6 @@ def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_imag
 def rows_text(values: Doubles) -> str:
     """Return rows of numbers (F, C) as the lines of a light file."""
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)
-
-
-NAMED_SUFFIXES = (".lp", ".json")
-_MOST_DIGITS = 9  # of the number of lights
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,106 +391,32 @@ def read_lights(
 ) -> NamedLights | Doubles:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
-    The frame of a JSON file is relative to AliceVision's, which has y down and z away. Raises InputError; see
-    read_light_directions.
+    The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises InputError; see
+    read_light_directions. A few lights below the horizon are left as they are.
     """
-    if path.suffix.lower() in NAMED_SUFFIXES:
-        return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
     table = read_light_table(path, n_images, form)
-    _, directions = lights_of(table, n_images if table.names is None else None, frame, form)
+    n_rows = n_images if table.names is None else None
+    _, directions = lights_of(table, n_rows, frame, form, leave_bad=form != "positions")
     if table.names is None:
         return directions
-    return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions)
+    return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions, table.intensities)
 
 
 def check_writable(path: Path) -> None:
     """Raise UsageError for a light file whose format is only read."""
     suffix = path.suffix.lower()
-    if suffix not in (".lp", ".npy") and suffix in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES):
-        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint="Write .txt, .lp or .npy")
+    if _written_as(suffix) is None:
+        *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))
+        hint = f"Write {', '.join(most)} or {last}"
+        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=hint)
 
 
 def encode_lights(path: Path, directions: Doubles, images: Sequence[Path]) -> bytes:
     """Return a light file of directions (F, 3) of images, in the format that its suffix names; see check_writable."""
-    suffix, text = path.suffix.lower(), rows_text(directions)
-    if suffix == ".npy":
-        np.save(file := io.BytesIO(), directions)
-        return file.getvalue()
-    if suffix == ".lp":
-        rows = zip(images, text.splitlines(), strict=True)
-        text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
-    return text.encode(errors="surrogateescape")
+    encode = _written_as(path.suffix.lower())
+    assert encode is not None
+    return encode(directions, images)
 
 
-def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
-    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may contain spaces."""
-    stored = read_lines(path, else_latin_1=True)
-    content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
-    if not content:
-        raise InputError("the file is empty, expected the number of lights on the first line", path=path)
-    (first, count), *rows = content
-    if not count.isdecimal():
-        raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
-    if int(count[:_MOST_DIGITS]) != len(rows):
-        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
-        raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
-    if not rows:
-        raise InputError("the file contains no lights", path=path, line=first)
-    names, vectors = [], []
-    commas = uses_decimal_commas([text for _, text in rows], 3)
-    for line, text in rows:
-        words = text.rsplit(maxsplit=3)
-        if len(words) < 4:
-            raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
-        names.append(image_name(words[0], []))
-        numbers = split_words(" ".join(words[1:]), decimal_commas=commas)
-        vectors.append([parse_number(word, path, line) for word in numbers[:3]])
-    lines = tuple(line for line, _ in rows)
-    directions = unit_directions(np.array(vectors) @ frame.matrix.T + 0.0, path, lines, [""] * len(lines))
-    return NamedLights(path, tuple(names), lines, directions)
-
-
-def _read_json(path: Path, frame: LightFrame) -> NamedLights:
-    """Read AliceVision's lights: objects with viewId, type (directional), direction [x, y, z], intensity [r, g, b]."""
-    try:
-        document = parse_json("\n".join(read_lines(path)))
-    except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
-    except ValueError as error:
-        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
-    lights = document.get("lights") if isinstance(document, dict) else None
-    if not isinstance(lights, list) or not lights:
-        raise InputError('found no list "lights", expected lights as AliceVision writes them', path=path)
-    names, vectors, intensities = [], [], []
-    for number, light in enumerate(lights, start=1):
-        if not isinstance(light, dict):
-            raise InputError(f"light {number} is not an object", path=path)
-        kind = light.get("type", "directional")
-        if kind != "directional":
-            problem = f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'"
-            raise InputError(problem, path=path, hint="Calibrate for distant lights, one direction a light")
-        names.append(image_name(str(light.get("viewId", number)), []))
-        vectors.append(_three_numbers(light, "direction", number, path))
-        if "intensity" in light:
-            intensities.append(_three_numbers(light, "intensity", number, path))
-            if (least := min(intensities[-1])) <= 0:
-                raise InputError(f"light {number} has the intensity {least:g}, expected above 0", path=path)
-    if intensities and len(intensities) != len(lights):
-        problem = f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none"
-        raise InputError(problem, path=path)
-    turned = np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0  # no -0
-    lines, places = (None,) * len(lights), [f" as light {number}" for number in range(1, len(lights) + 1)]
-    directions = unit_directions(turned, path, lines, places)
-    return NamedLights(path, tuple(names), lines, directions, np.array(intensities) if intensities else None)
-
-
-def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
-    values = light.get(key)
-    numbers = [
-        float(value)
-        for value in (values if isinstance(values, list) else ())
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-    ]
-    if len(numbers) != 3 or len(values or ()) != 3:
-        raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
-    return numbers
+def _written_as(suffix: str) -> Callable[[Doubles, Sequence[Path]], bytes] | None:
+    return next((each for each in FORMATS if suffix in each.suffixes), FORMATS[0]).encode

@@ -179,6 +179,14 @@ def take_pixels(image: Array, mask: Bools) -> Array:
     return np.stack([image[..., channel][mask] for channel in range(image.shape[2])], axis=1)
 
 
+def take_around(image: Array, around: Bools) -> Array:
+    """Return the pixels (R, C) around the object. Values that are no light, such as NaN, become 0: no pixel is lost."""
+    pixels = take_pixels(image, around)
+    if pixels.dtype.kind == "f":
+        pixels = np.where(np.isfinite(pixels) & (pixels > 0), pixels, 0).astype(pixels.dtype)
+    return pixels
+
+
 def pixel_reader(
     radiometry: RadiometricCalibration,
     mask: Bools,
@@ -208,7 +216,7 @@ def pixel_reader(
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         image = window.of(image)
         stored = take_pixels(image, mask)
-        used = stored[wanted] if around is None else np.concatenate((stored, take_pixels(image, around)))
+        used = stored[wanted] if around is None else np.concatenate((stored, take_around(image, around)))
         linear = linear_light(used, path, radiometry.curve)
         return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
 

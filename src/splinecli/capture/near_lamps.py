@@ -16,10 +16,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.files import LIGHT_POSITIONS, find_lights, find_named, stamp_content
+from splinecli.capture.files import LIGHT_POSITIONS, find_named, stamp_content
 from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
-from splinecli.capture.light_files import NAMED_SUFFIXES, read_light_positions
-from splinecli.capture.light_rows import ARRAY_SUFFIXES, LightFrame, read_light_rows
+from splinecli.capture.light_files import FORMATS, find_lights, format_of, read_light_positions
+from splinecli.capture.light_rows import LightFrame, read_light_rows
 from splinecli.capture.linearise import Window
 from splinecli.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.errors import InputError, UsageError
@@ -215,7 +215,7 @@ def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools)
 
 def positions_as_directions(path: Path) -> list[CaptureWarning]:
     """Warn of a text file of light directions whose vectors have lengths as positions of lamps have."""
-    if path.suffix.lower() in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES) or is_substitution(path):
+    if is_substitution(path) or format_of(path).read != FORMATS[0].read:
         return []
     try:
         vectors = read_light_rows(path, expected="x y z", n_numbers=3).as_array()

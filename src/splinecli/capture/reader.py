@@ -1,5 +1,6 @@
 """Open a capture: find its files and read its lights, or take arrays that are already in memory."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from splinecli import capture_warnings as codes
 from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_files
-from splinecli.capture.formats.facts import UPRIGHT, check_exposures, common_orientation, read_facts
+from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_facts
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import NamedLights, read_light_intensities, read_lights, unit_directions
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
@@ -23,6 +24,7 @@ from splinecli.capture.linearise import (
     Window,
     collect_observations,
     linear_light,
+    take_around,
 )
 from splinecli.capture.near_lamps import (
     NO_LAMP_OPTIONS,
@@ -102,6 +104,7 @@ def open_capture(
     stamp = stamp_files(files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera))
     in_folder = files.images
     files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    warnings += files.warnings
     if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
         flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
         radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
@@ -112,8 +115,10 @@ def open_capture(
     if files.light_directions is not None and form == "xyz" and near is None:
         warnings += positions_as_directions(files.light_directions)
     facts = tuple(map(read_facts, files.images))
-    if found_intensities is None:
-        check_exposures(facts)
+    factors = np.ones((len(facts), 3))
+    if found_intensities is None and (exposures := exposure_factors(facts)) is not None:
+        factors *= np.array(exposures[0])[:, None]
+        warnings.append(CaptureWarning(codes.EXIF_EXPOSURE, exposures[1]))
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
         text = f"{files.ambient.name} was subtracted from all images as ambient light."
@@ -121,7 +126,7 @@ def open_capture(
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
         text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
-        text += " the lights. To use it, list all images in filenames.txt."
+        text += " the lights. To use it as one, list all images in filenames.txt."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve
@@ -138,13 +143,14 @@ def open_capture(
         files,
         facts,
         directions,
-        np.ones((len(facts), 3)) if found_intensities is None else found_intensities,
+        factors if found_intensities is None else found_intensities,
         tuple(warnings),
         radiometry,
         white_level,
         intensities_known=equal or found_intensities is not None,
         intensities_measured=found_intensities is not None,
         light_frame=light_frame,
+        light_numbers=files.kept,
         lamps=near,
         camera_matrix=camera_matrix,
         window=window.on(facts[0]),
@@ -186,13 +192,12 @@ def _read_lights(
         others = [image.name for image in files.images if image not in images]
         names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
         them = "it" if len(others) == 1 else "them"
-        text = (
-            f"{names}: left out, because {path.name} has no light for {them}, and the other images have another size."
-        )
+        text = f"{names}: left out, because {path.name} has no light for {them}, and the other images have another"
+        text += f" {'size' if len(set(map(_stated_size, files.images))) > 1 else 'form of name'}."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         files = replace(files, images=images)
     if not isinstance(lights, NamedLights):
-        return files, lights, None, warnings
+        return _drop_bad_lights(files, lights, None, warnings)
     images, how = lights.match(files.images)
     if len(images) < len(files.images):
         text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
@@ -200,24 +205,61 @@ def _read_lights(
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."
         warnings.append(CaptureWarning(codes.LIGHTS_MATCHED, text))
-    return replace(files, images=images), lights.directions, lights.intensities, warnings
+    return _drop_bad_lights(replace(files, images=images), lights.directions, lights.intensities, warnings)
+
+
+def _drop_bad_lights(
+    files: CaptureFiles, directions: Doubles, intensities: Doubles | None, warnings: list[CaptureWarning]
+) -> tuple[CaptureFiles, Doubles, Doubles | None, list[CaptureWarning]]:
+    """Return the arguments without the few lights that are zero or below the horizon; see unit_directions."""
+    good = directions[:, 2] > 0
+    if good.all():
+        return files, directions, intensities, warnings
+    bad = ", ".join(f"{files.images[light].name} (z = {directions[light, 2]:.2g})" for light in np.flatnonzero(~good))
+    assert files.light_directions is not None
+    text = f"{bad}: left out, because its light in {files.light_directions.name} is not above the horizon."
+    warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
+    files = replace(
+        files, images=tuple(np.array(files.images, object)[good]), kept=tuple(np.flatnonzero(good).tolist())
+    )
+    return files, directions[good], None if intensities is None else intensities[good], warnings
 
 
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
 ) -> tuple[tuple[Path, ...], Doubles | NamedLights]:
-    """Return the images that a light file is for, and its lights: all images, or else those of the usual size."""
+    """Return the images that a light file is for, and its lights.
+
+    These are all images, or else those of the usual size, or those whose names differ only in their numbers.
+    """
     try:
         return images, read_lights(path, len(images), frame, form)
-    except InputError:
-        stated = [read_facts(image).stated_size for image in images]
-        sizes = [None if size is None else size[0][:2] for size in stated]
-        usual = Counter(sizes).most_common(1)[0][0]
-        alike = tuple(image for image, size in zip(images, sizes, strict=True) if size == usual)
-        if len(alike) < len(images):
-            with suppress(InputError):
-                return alike, read_lights(path, len(alike), frame, form)
-        raise
+    except InputError as error:
+        for key in (_stated_size, _name_form):
+            keys = [key(image) for image in images]
+            usual = Counter(keys).most_common(1)[0][0]
+            alike = tuple(image for image, of_image in zip(images, keys, strict=True) if of_image == usual)
+            if len(alike) < len(images):
+                with suppress(InputError):
+                    return alike, read_lights(path, len(alike), frame, form)
+        found = _COUNTS.match(error.problem)
+        if found is None or int(found[1]) >= len(images):
+            raise
+        names = [image.name for image in images[int(found[1]) :]]
+        hint = f"In the order of the images, none is left for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
+
+
+_COUNTS = re.compile(r"found (\d+) [a-z ]+, expected \d+, one for each image")
+
+
+def _stated_size(image: Path) -> tuple[int, ...] | None:
+    size = read_facts(image).stated_size
+    return None if size is None else size[0][:2]
+
+
+def _name_form(image: Path) -> str:
+    return re.sub(r"\d+", "0", image.name.lower())
 
 
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Doubles:
@@ -284,12 +326,12 @@ def capture_from_arrays(
         for index, image in enumerate(stack):
             pixels = image if image.ndim == 3 else image[..., None]
             values, path = pixels[inside], Path(f"images[{index}]")
-            used = values if around is None else np.concatenate((values, pixels[around]))
+            used = values if around is None else np.concatenate((values, take_around(pixels, around)))
             yield StoredPixels(path, values, linear_light(used, path), intensities[index])
 
     observations, saturation, warnings, colours = collect_observations(pixels(), *sizes)
     if as_stored:
-        warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
+        warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
     if colours is not None:
         intensities = intensities * colours
         observations = collect_observations(pixels(), *sizes)[0]

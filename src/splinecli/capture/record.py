@@ -207,7 +207,8 @@ class Capture:
             raise InputError(f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights")
         if len(lights) < MIN_LIGHTS:
             hint = "A normal has three unknowns, so three images under different lights are the fewest"
-            raise InputError(f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}", hint=hint)
+            found = "1 light" if len(lights) == 1 else f"{len(lights)} lights"
+            raise InputError(f"{self.name}: {found}, expected at least {MIN_LIGHTS}", hint=hint)
         self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
         self._check_shape("light colours", self.estimated_colours, (len(lights), 3))
         if not np.isfinite(lights).all():
@@ -335,9 +336,12 @@ class StoredCapture:
         observations, warnings, restored = self.capture.observations, self.capture.warnings, None
         if intensities is not None:
             observations /= intensities.astype(np.float32)
+            lowest, highest = (f"{value:.2f}" for value in (intensities.min(), intensities.max()))
+            if lowest == highest:
+                lowest, highest = (f"{value:.4f}" for value in (intensities.min(), intensities.max()))
             text = (
                 "The light intensities were estimated from the images: they are unequal, from"
-                f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you"
+                f" {lowest} to {highest} times their mean. Use --intensities FILE if you"
                 " have measured them, or --intensities equal to assume equal ones."
             )
             warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))

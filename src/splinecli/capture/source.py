@@ -37,7 +37,7 @@ from splinecli.capture.linearise import (
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Doubles, Integers
 from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
 from splinecli.restoration.lens_blur import remove_blur, surroundings
@@ -67,6 +67,7 @@ class CaptureSource:
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
+    light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # what is known of near lamps, or None
     camera_matrix: Doubles | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
@@ -78,6 +79,16 @@ class CaptureSource:
     @property
     def n_lights(self) -> int:
         return len(self.light_directions)
+
+    def places_of(self, light_numbers: Sequence[int] | None) -> Sequence[int] | None:
+        """Return the indices of lights from their numbers in the light file. Raises UsageError."""
+        if light_numbers is None or self.light_numbers is None:
+            return light_numbers
+        for number in check_light_indices(light_numbers, self.light_numbers[-1] + 1):
+            if number not in self.light_numbers:
+                hint = "Leave it out: its direction is wrong"
+                raise UsageError(f"light {number} was left out, and cannot be chosen", hint=hint)
+        return [self.light_numbers.index(number) for number in light_numbers]
 
     def read(
         self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None, *, as_stored: bool = False
@@ -129,12 +140,12 @@ class CaptureSource:
         observations, saturation, warnings, colours = collected
         equal = self.intensities_known and not self.intensities_measured
         if equal or as_stored or not divide_colours:
-            warnings, colours = [each for each in warnings if each.code != ESTIMATED_COLOURS], None
+            warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
         if colours is not None:  # only the mean of the channels was kept, so the images are read again
             del images, collected, observations
             rgb = self.light_intensities.copy()
             rgb[list(indices)] *= colours
-            warnings = [each for each in warnings if each.code == ESTIMATED_COLOURS]
+            warnings = [each for each in warnings if each.kind == ESTIMATED_COLOURS]
             again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
             stored = again.read_stored(indices, progress, divide_colours=False)
             return replace(stored, capture=replace(stored.capture, estimated_colours=colours))

@@ -22,7 +22,7 @@ from splinecli.training import defaults
 if TYPE_CHECKING:
     from splinecli.evaluation.protocol import Evaluation
     from splinecli.training.loop import Trainer
-    from splinecli.training.run_log import Metrics
+    from splinecli.training.run_files import Metrics
 
 
 def calibrate(options: CalibrateOptions) -> None:

@@ -190,7 +190,8 @@ class Messages(Observer):
             if now - shown >= LINE_SECONDS and done < total:
                 shown = now
                 speed = (done - start) / (now - began)
-                notes = [_in_words(speed, unit), f"{(total - done) / speed:.0f} s left"] if unit else []
+                notes = [_in_words(speed, unit)] if unit else []
+                notes += [f"{(total - done) / speed:.0f} s left"] if speed else []
                 self.say(", ".join((f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))))
 
         return advance

@@ -174,6 +174,7 @@ def info(reading: Reading, options: InfoOptions) -> int:
         plot=options.plot,
         overwrite=options.overwrite,
         check_lights=options.check_lights,
+        auto_mask=options.auto_mask,
         mended_lights=options.mended_lights,
     )
     print_report(report, *summary_lines(report), as_json=options.as_json, quiet=options.quiet)

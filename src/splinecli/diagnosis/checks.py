@@ -1,14 +1,14 @@
 """The checks of a capture's lights and images against each other, which `infer` and `info` make, in their order."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from splinecli import capture_warnings as codes
 from splinecli.capture import Capture, CaptureSource
-from splinecli.capture_warnings import PROBABLY_WRONG, CaptureWarning
-from splinecli.diagnosis.evidence import Evidence, gray_intensities
+from splinecli.capture_warnings import CaptureWarning, WarningKind
+from splinecli.diagnosis.capture_sample import CaptureSample, gray_intensities
 from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.diagnosis.odd_images import check_ground_truth
 from splinecli.diagnosis.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
@@ -21,32 +21,19 @@ from splinecli.maths import Doubles, Floats
 from splinecli.maths.normals import angle_between_deg
 from splinecli.restoration.lamps import estimate_light_intensities
 
-SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
-MOST_BACKGROUND = 0.5  # share of near black pixels above which a capture without a mask carries a warning
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 
-SAME_IMAGE = 1e-12
-"""One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
-
-SAME_LIGHT_DEG = 0.01  # images under lights closer than this may be the same
 
 DECISIVE = 0.35
 """Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
 ones, none leaves so little. Intensities are an exception, since on flat objects they explain any order."""
 
-_SAME_INTENSITIES = 0.4  # share of the spread of other intensities that a simple reading of the file may leave
-
-SCALES, SCALE_TOLERANCE = (4, 6, 8), 0.2
-"""The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the brightness of an
-image may differ from them."""
 
 _FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
 _MOST_NAMED = 4  # shifted images in a sentence
 
-Check = Callable[[Evidence], Iterable[CaptureWarning]]
 
-
-def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
+def shifted_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
     shifts, names = seen.shifts, seen.names
     if not shifts:
         return
@@ -59,7 +46,7 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
     yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
 
 
-def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
+def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
     """Warn of an image with the values of a camera of fewer bits than the files of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
     values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may outshine the others
@@ -70,8 +57,10 @@ def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
             continue
         factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
         stops = abs(np.log2(max(factor, 1e-6)))
-        bits = min(SCALES, key=lambda bits: abs(bits - stops))
-        if abs(bits - stops) > SCALE_TOLERANCE:
+        # The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many bits the
+        # brightness of an image may differ from them.
+        bits = min((4, 6, 8), key=lambda bits: abs(bits - stops))
+        if abs(bits - stops) > 0.2:
             continue
         mended = seen.observations.copy()
         mended[:, place] /= factor
@@ -83,12 +72,12 @@ def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
         yield CaptureWarning(codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended))
 
 
-def odd_image(seen: Evidence) -> list[CaptureWarning]:
+def odd_image(seen: CaptureSample) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
             text = f"{name} is black. Its lamp failed. Photograph it again, or leave it out."
-            return [CaptureWarning(codes.IMAGE_ODD, text, _turn_by_deg(seen, [seen.names.index(name)]))]
+            return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [seen.names.index(name)]))]
     odd = seen.light_check.odd_image
     if odd is None or odd.place in [shift.place for shift in seen.shifts]:
         return []
@@ -98,10 +87,10 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " the lights cannot explain is left. Its lamp was moved or failed, its exposure differs, or a shadow fell on"
         " the object. Photograph it again, or leave it out."
     )
-    return [CaptureWarning(codes.IMAGE_ODD, text, _turn_by_deg(seen, [odd.place]))]
+    return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [odd.place]))]
 
 
-def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
+def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
     """Return by how many degrees images turn the normals, against those of the others; None with too few others."""
     others = [place for place in range(len(seen.names)) if place not in places]
     if len(others) < 3:
@@ -110,27 +99,28 @@ def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
     return median_turn_deg(observations, lights, lights[others], observations[:, others])
 
 
-def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
-    if seen.background > MOST_BACKGROUND:
-        text = f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
-        text += " background mean nothing. Add --auto-mask, or give a mask."
+def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
+    if seen.background > 0.5:  # the share of near black pixels
+        text = f"{100 * seen.background:.0f} % of the pixels are near black. If they are background, their normals mean"
+        text += " nothing: add --auto-mask, or give a mask."
         yield CaptureWarning(codes.NO_MASK, text)
 
 
-def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
+def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread < SMALLEST_SPREAD:
+    if spread < 0.1:  # lights that determine normals worse; see light_spread
         where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
         times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
         text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
-        yield CaptureWarning(codes.LIGHTS_CROWDED, text)
+        yield CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text)
 
 
-def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
+def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
     pairs = sorted({*repeated_images(seen.sample.observations), *seen.copies})
     differ = "" if seen.found else ", but their lights differ"
     if differ:
-        pairs = [pair for pair in pairs if angle_between_deg(*seen.directions[list(pair)]) > SAME_LIGHT_DEG]
+        # Images under lights closer than this may be the same.
+        pairs = [pair for pair in pairs if angle_between_deg(*seen.directions[list(pair)]) > 0.01]
     if pairs:
         first, second = (seen.names[place] for place in pairs[0])
         others = len(pairs) - 1
@@ -144,7 +134,7 @@ def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
         yield CaptureWarning(codes.REPEATED_IMAGES, text, max(errors_deg, default=None))
 
 
-def rough_lights(seen: Evidence) -> list[CaptureWarning]:
+def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
     """Suggest to refine the lights where this makes them fit much better."""
     if seen.has_positions or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None:
         return []
@@ -156,7 +146,7 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
 
-def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWarning]:
+def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[CaptureWarning]:
     """Warn of images that fit much better if they are read in another way; see readings.py.
 
     Readings that leave more than the largest ratio of the residual are not named.
@@ -179,14 +169,14 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
             f"The images look display-encoded but are read as linear: if their values are decoded, {left}. Add"
             f" --transfer srgb{'' if reading.amount == SRGB_EXPONENT else f' or gamma:{reading.amount:g}'}."
         )
-        return [CaptureWarning(codes.ENCODED_VALUES, text, error_deg)]
+        return [CaptureWarning(codes.NONLINEARITY_SUSPECTED, text, error_deg)]
     if reading.kind == "near":
         text = (
             f"The lamps look near, about {reading.amount:.1f} widths of the object away, but are treated as distant: at"
             f" this distance, {left}. Measure the distance and the width of the object, or try --light-distance"
             f" {reading.amount:.1f} --object-width 1."
         )
-        return [CaptureWarning(codes.LAMPS_NEAR, text, error_deg)]
+        return [CaptureWarning(codes.NEAR_LIGHTS_SUSPECTED, text, error_deg)]
     if reading.kind == "offset":
         text = (
             "All images look as if they contained ambient light, or a black level that was not subtracted:"
@@ -205,7 +195,7 @@ _CAUSES: dict[Kind, str] = {
 }
 
 
-def _intensities_text(seen: Evidence, reading: Reading, left: str) -> str:
+def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     given = seen.intensities
     if given is None:
         return (
@@ -220,7 +210,8 @@ def _intensities_text(seen: Evidence, reading: Reading, left: str) -> str:
     }
     errors = {words: float(np.std(needed - way)) for words, way in ways.items()}
     words = min(errors, key=lambda each: errors[each])
-    how = f", for example {words}" if errors[words] < _SAME_INTENSITIES * np.std(np.log(reading.intensities)) else ""
+    # A simple reading of the file leaves at most this share of the spread.
+    how = f", for example {words}" if errors[words] < 0.4 * np.std(np.log(reading.intensities)) else ""
     return (
         f"The light intensities that are given do not fit the images: with other ones{how}, {left}. Check that their"
         " file is in the order of the images, or leave them out with --intensities equal."
@@ -230,52 +221,62 @@ def _intensities_text(seen: Evidence, reading: Reading, left: str) -> str:
 REPEATED = frozenset({codes.REPEATED_IMAGES})  # where the lights differ, these contradict any others
 
 DOUBTED = REPEATED | {
-    codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED
+    codes.IMAGES_SHIFTED, codes.IMAGE_INCONSISTENT, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_ILL_CONDITIONED
 }  # fmt: skip
 """After these warnings, nothing that relies on the lights can be told."""
 
-READ_OTHERWISE = frozenset({codes.ENCODED_VALUES, codes.LAMPS_NEAR, codes.CONSTANT_LIGHT})
+READ_OTHERWISE = frozenset({codes.NONLINEARITY_SUSPECTED, codes.NEAR_LIGHTS_SUSPECTED, codes.CONSTANT_LIGHT})
 """After these warnings, the normals tell nothing of the lights' frame, and the images nothing of their order."""
 
-EXPLAINED = DOUBTED | READ_OTHERWISE
 
-CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
-    (same_images, frozenset()),
-    (lambda seen: other_readings(seen, DECISIVE), REPEATED),
-    (shifted_images, READ_OTHERWISE),
-    (other_scale, REPEATED),
-    (odd_image, REPEATED | {codes.IMAGE_SCALE}),
-    (
+@dataclass(frozen=True)
+class Check:
+    """A row of CHECKS.
+
+    find: returns warnings of what it sees.
+    unless: earlier warnings after which it is skipped.
+    needs_lights: whether it is skipped where the lights were found from the images.
+    """
+
+    find: Callable[[CaptureSample], Iterable[CaptureWarning]]
+    unless: frozenset[WarningKind] = frozenset()
+    needs_lights: bool = True
+
+
+CHECKS = [
+    Check(same_images, needs_lights=False),
+    Check(lambda seen: other_readings(seen, DECISIVE), REPEATED),
+    Check(shifted_images, READ_OTHERWISE, needs_lights=False),
+    Check(other_scale, REPEATED),
+    Check(odd_image, REPEATED | {codes.IMAGE_SCALE}),
+    Check(
         lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict),
         REPEATED | READ_OTHERWISE,
     ),
-    (missing_mask, frozenset()),
-    (crowded_lights, frozenset()),
-    (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
-    (other_readings, DOUBTED | READ_OTHERWISE),
-    (rough_lights, EXPLAINED),
-)
-"""The checks, and the codes of earlier warnings after which each is skipped."""
-
-WITHOUT_LIGHTS = (shifted_images, missing_mask, same_images)
-"""The checks that need no lights. Where the lights were found from the images, only these are made."""
+    Check(missing_mask, needs_lights=False),
+    Check(crowded_lights),
+    Check(lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
+    Check(other_readings, DOUBTED | READ_OTHERWISE),
+    Check(rough_lights, DOUBTED | READ_OTHERWISE),
+]
+"""The checks of a capture's lights and images, in their order."""
 
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source; see check_evidence."""
+    """Return warnings about a capture that was read from this source; see check_sample."""
     samples, truth = _samples(capture), capture.ground_truth
-    seen = Evidence.of_source(source, samples, capture.light_indices, truth=truth, strict=strict)
-    return check_evidence(replace(seen, estimated=capture.estimated_intensities))[1]
+    seen = CaptureSample.of_source(source, samples, capture.light_indices, truth=truth, strict=strict)
+    return check_sample(replace(seen, estimated=capture.estimated_intensities))[1]
 
 
 def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list[CaptureWarning]:
-    """Return warnings about a capture that was made from arrays; see check_evidence.
+    """Return warnings about a capture that was made from arrays; see check_sample.
 
     Args:
         intensities: (F,) or (F, 3), those that were given; None for none.
     """
     (sample, closeup), lamps, n_lights = _samples(capture), capture.lamps, capture.n_lights
-    seen = Evidence(
+    seen = CaptureSample(
         [f"images[{index}]" for index in range(n_lights)],
         capture.light_directions,
         range(n_lights),
@@ -289,7 +290,7 @@ def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list
         has_positions=lamps is not None,
         found=capture.light_errors_deg is not None,
     )
-    return check_evidence(seen)[1]
+    return check_sample(seen)[1]
 
 
 def _samples(capture: Capture) -> tuple[Sample, Sample]:
@@ -300,16 +301,14 @@ def _samples(capture: Capture) -> tuple[Sample, Sample]:
     return sample, sample_observations(capture.observations, capture.mask, closeup_of(capture.mask))
 
 
-def check_evidence(seen: Evidence) -> tuple[LightCheck | None, list[CaptureWarning]]:
+def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWarning]]:
     """Return what images without dark background say about their lights (None if found in them), and warnings."""
     (sample, background), (closeup, _) = leave_out_background(seen.sample), leave_out_background(seen.closeup)
     seen = replace(seen, sample=sample, closeup=closeup, background=background)
     warnings: list[CaptureWarning] = []
-    for check, unless in CHECKS:
-        if seen.found and check not in WITHOUT_LIGHTS:
-            continue
-        if unless.isdisjoint(warning.code for warning in warnings):
-            warnings += check(seen)
+    for check in CHECKS:
+        if not (seen.found and check.needs_lights) and check.unless.isdisjoint(each.kind for each in warnings):
+            warnings += check.find(seen)
     return None if seen.found else seen.light_check, warnings
 
 
@@ -328,7 +327,8 @@ def repeated_images(observations: Floats) -> list[tuple[int, int]]:
     values = observations.astype(np.float64)
     values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)
     varied = np.ptp(values, axis=0) > 0
-    same = (1 - values.T @ values < SAME_IMAGE) & varied & varied[:, None]
+    # One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more.
+    same = (1 - values.T @ values < 1e-12) & varied & varied[:, None]
     return [(int(first), int(second)) for first, second in np.argwhere(np.triu(same, 1))]
 
 
@@ -345,6 +345,6 @@ def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
 
 def refuse_if_strict(warnings: Iterable[CaptureWarning], name: str, *, strict: bool) -> None:
     """Raise InputError for the first warning that says that an input is probably wrong, if `strict`."""
-    wrong = next((warning for warning in warnings if warning.code in PROBABLY_WRONG), None)
+    wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:
         raise InputError(f"{name}: {wrong.text.removesuffix('.')}", hint="Leave --strict out to go on nevertheless")

@@ -15,39 +15,27 @@ import numpy as np
 from splinecli import capture_warnings as codes
 from splinecli.capture.light_rows import BOTH_NEGATED, PLANE_FRAMES, LightFrame
 from splinecli.capture_warnings import CaptureWarning
-from splinecli.diagnosis.light_order import (
-    FEWER_LEFT,
-    HALF_VECTORS,
-    MAX_MENDED,
-    MIN_LIGHTS,
-    UNKNOWN_ORDER,
-    ZENITH,
-    check_order,
-)
+from splinecli.diagnosis.light_order import HALF_VECTORS, ORDER, UNKNOWN_ORDER, ZENITH, check_order
 from splinecli.diagnosis.odd_images import OddImage, find_odd_image
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import RoughNormals, ShadowCheck, median_turn_deg, rough_normals
 from splinecli.maths import Bools, Doubles, Floats, Integers
 
-CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
-"""The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
-TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
-NEAR = 0.1  # candidates whose advantages differ by less are near equals
-LOWEST_CURL = 0.1  # Curls below this are noise. On a cap of a sphere, other frames give little more.
+@dataclass(frozen=True)
+class FrameLimits:
+    """Weights and thresholds of the advantage of a frame; from 1 on, it is better."""
 
-LEAST_ROTATION_DEG = 10  # from any frame; smaller rotations are errors of a calibration
-ROTATED = 2.0
-"""Smallest advantage of lights rotated about the view axis by any angle: it is fitted, so it wins a little by noise."""
+    curl_weight: float = 5.0  # of a ratio of curls: its logarithm
+    rim_weight: float = 1.0  # of a difference of rims
+    told_apart: float = 0.5  # the smallest difference of advantages that tells two frames apart
+    lowest_curl: float = 0.1  # less is noise; on a cap of a sphere, other frames give little more
+    rotated: float = 2.0  # of lights rotated by any angle: it is fitted, so it wins a little by noise
+    rim_from: float = 0.3  # share of steep pixels at the rim; with fewer, the mask's edge is no outline
+    rim_fully: float = 0.6  # from here on, the outline counts fully
 
-OPEN_ERROR_DEG = 10.0
-"""Error stated where a bump cannot be told from a hollow although shadows of the given lights are missing: with it,
-about a quarter of the normals of a good capture are expected within 5 degrees."""
 
-_RANDOM_ORDERS = 3  # of the lights, under which the normals of an unknown order are compared with the given ones
-
-RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
-"""Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
+FRAME = FrameLimits()
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ class LightCheck:
         """What the images do not tell about the lights, in words."""
         missing = []
         if np.isnan(self.given_misfit):
-            missing.append(f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)")
+            missing.append(f"their order (fewer than {ORDER.min_lights} lights, too few lit pixels, or a flat object)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
@@ -110,7 +98,7 @@ class LightCheck:
     @property
     def outline_tells(self) -> bool:
         """Whether the outline shows that x and y are not both negated."""
-        return bool(2 * RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) >= 1)
+        return bool(2 * FRAME.rim_weight * self.outline_counts * abs(np.nan_to_num(self.given.rim)) >= 1)
 
 
 def check_lights(
@@ -157,7 +145,7 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
-    weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
+    weight = (normals.rim_steepness - FRAME.rim_from) / (FRAME.rim_fully - FRAME.rim_from)
     weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
 
     def candidate(name: str, frame: LightFrame | None, matrix: Doubles, **kind: Any) -> Candidate:
@@ -174,7 +162,7 @@ def _check_frame_and_order(
     judged = judged if evidence is None else evidence.judged
     ranked = sorted(judged, key=lambda other: -other.advantage)
     # Rotations are listed only where they count.
-    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= ROTATED]
+    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= FRAME.rotated]
     order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
     if best is not None:
@@ -184,7 +172,8 @@ def _check_frame_and_order(
     lights = light_directions[chosen]
     if order == UNKNOWN_ORDER:
         rng = np.random.default_rng(0)
-        orders = [rng.permutation(lights) for _ in range(_RANDOM_ORDERS)]
+        # Normals under these random orders are compared with those under the given one.
+        orders = [rng.permutation(lights) for _ in range(3)]
         turn_deg = float(np.median([median_turn_deg(observations, lights, others) for others in orders]))
     elif mended is not None:
         turn_deg = median_turn_deg(observations, lights, mended)
@@ -192,7 +181,7 @@ def _check_frame_and_order(
         order, best = best.name, None  # one of several orders that fit, told by the normals
     check = LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None)
     tie = best is not None and mirror_twin(check, best) is not None
-    clear = not tie and not found.misfit > MAX_MENDED
+    clear = not tie and not found.misfit > ORDER.mended
     return replace(
         check,
         mended=mended if clear else None,
@@ -206,7 +195,8 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Doubles]]:
     """Yield rotations of the lights about the view axis after which the normals have the least curl, in words."""
     for mirrored in (False, True):
         least_deg = normals.least_curl_deg(mirrored=mirrored)
-        if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < LEAST_ROTATION_DEG:
+        # Smaller rotations from the nearest frame are errors of a calibration.
+        if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < 10:
             continue
         for degrees in (least_deg, least_deg - np.copysign(180, least_deg)):
             cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -237,7 +227,7 @@ def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -
         for other in judged
     ]
     both = next(other for name, (_, other) in told.items() if name == BOTH_NEGATED.describe())
-    return _ShadowEvidence(judged, shadows.evidence(both) < -TOLD_APART, shadows.leaves_open(both))
+    return _ShadowEvidence(judged, shadows.evidence(both) < -FRAME.told_apart, shadows.leaves_open(both))
 
 
 def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:
@@ -250,25 +240,26 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
-    if better and better[0].advantage > (simple[0].advantage if simple else 0) + TOLD_APART:
+    if better and better[0].advantage > (simple[0].advantage if simple else 0) + FRAME.told_apart:
         better = [candidate for candidate in better if candidate not in simple] or better
     else:
         better = simple
-    near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]
+    # Candidates whose advantages differ by less are near equals.
+    near = [candidate for candidate in better if candidate.advantage > better[0].advantage - 0.1]
     preferred = [candidate for candidate in near if candidate.is_order == in_order]
     return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
 
 
 def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
-    curls = np.log(max(given.curl, LOWEST_CURL) / max(other.curl, LOWEST_CURL))
+    curls = np.log(max(given.curl, FRAME.lowest_curl) / max(other.curl, FRAME.lowest_curl))
     rims = weight * (other.rim - given.rim)
-    return float(CURL_WEIGHT * np.nan_to_num(curls) + RIM_WEIGHT * np.nan_to_num(rims))
+    return float(FRAME.curl_weight * np.nan_to_num(curls) + FRAME.rim_weight * np.nan_to_num(rims))
 
 
 def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
     """Return the reading with x and y negated in addition, if the evidence cannot tell it from the best one."""
     twin = _negated(check.candidates, best)
-    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - TOLD_APART else None
+    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - FRAME.told_apart else None
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
@@ -296,11 +287,11 @@ def light_warnings(
     """
     warnings = []
     if check.order is not None:
-        code = codes.LIGHT_FRAME if check.order in (ZENITH, HALF_VECTORS) else codes.LIGHT_ORDER
-        warnings.append(CaptureWarning(code, _order_text(check, light_file), check.error_deg))
+        kind = codes.LIGHT_FRAME if check.order in (ZENITH, HALF_VECTORS) else codes.LIGHT_ORDER
+        warnings.append(CaptureWarning(kind, _order_text(check, light_file), check.error_deg))
     if check.best is not None:
-        code = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
-        warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file), check.error_deg))
+        kind = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
+        warnings.append(CaptureWarning(kind, _frame_text(check, check.best, frame, light_file), check.error_deg))
     if check.lacks_shadows:
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not in the images. With"
@@ -308,7 +299,9 @@ def light_warnings(
             " decide which is right. Compare bumps and hollows with the object. If they are exchanged, run again with"
             f" --light-frame {BOTH_NEGATED.after(frame)}."
         )
-        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, OPEN_ERROR_DEG))
+        # A bump cannot be told from a hollow. With this error, about a quarter of the normals of a good capture are
+        # expected within 5 degrees.
+        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
     if strict and check.unchecked:
         text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
@@ -328,7 +321,7 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
         remedy = "Replace each elevation by 90 degrees minus it."
     elif check.order == HALF_VECTORS:
         remedy = f"Double the angle of each light from the camera axis, as {_WRITES_MENDED} does."
-        if check.order_misfit > FEWER_LEFT * check.given_misfit:  # a ring, told by the albedo
+        if check.order_misfit > ORDER.half_left * check.given_misfit:  # a ring, told by the albedo
             return (
                 f"{light_file.name} probably contains half vectors, half-way between the lights and the camera axis:"
                 f" under them, steep slopes look brighter. {remedy}"

@@ -32,11 +32,7 @@ from splinecli.maths import Bools, Doubles, Floats, Integers
 from splinecli.maths.normals import unit
 
 FEWEST_IN_RING = 4
-_GAP_DEG = 3.0  # lights belong to one ring if their elevations follow each other at smaller steps
-_MOST_LEFT = 0.95  # one more ring is mended if at most this share of the misfit is left
 _EQUAL = 1e-3  # share of the misfit by which equal readings may differ
-_IN_ROUNDS = 0.8  # share of the lights that must be in rings which the azimuth goes round
-_NEARLY = 0.1  # the same of a ring that is compared with one other ring
 
 _WAYS = {
     "": (1, 1, 1),
@@ -87,7 +83,8 @@ def _seen_from(anchor: int, matrix: Doubles, rings: list[Integers], trials: _Tri
     for ring, readings in zip(rings, trials, strict=True):
         shown = unit(matrix[:, ring].T)
         distances = np.array([((unit(lights @ to_factors.T) - shown) ** 2).sum() for _, lights in readings])
-        chosen.append(int(np.flatnonzero(distances <= distances.min() * (1 + _NEARLY) + 1e-9)[0]))
+        # The first ring that is nearly as close as the closest
+        chosen.append(int(np.flatnonzero(distances <= distances.min() * (1 + 0.1) + 1e-9)[0]))
     return chosen
 
 
@@ -105,7 +102,7 @@ def _descend(
         for row, (ring, reading) in enumerate(places):
             stack[row, rings[ring]] = trials[ring][reading][1]
         misfits = factors.misfits(stack)
-        if misfits.min() > _MOST_LEFT * misfit:
+        if misfits.min() > 0.95 * misfit:  # one more ring is mended if at most this share of the misfit is left
             break
         # On a regular ring, several readings are the same. The first ones are the simplest.
         best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
@@ -119,7 +116,8 @@ def find_rings(lights: Doubles) -> Iterator[list[Integers]]:
     """Yield divisions of the lights (F, 3) into rings, as the indices of the lights of each ring that has enough."""
     elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
     order = elevation.argsort(kind="stable")
-    by_elevation = np.split(order, np.flatnonzero(np.diff(elevation[order]) > _GAP_DEG) + 1)
+    # Lights belong to one ring if their elevations follow each other at smaller steps.
+    by_elevation = np.split(order, np.flatnonzero(np.diff(elevation[order]) > 3.0) + 1)
     for division in (by_elevation, _rounds(lights)):
         rings = [np.sort(ring) for ring in division if len(ring) >= FEWEST_IN_RING]
         if len(division) > 1 and rings:
@@ -141,7 +139,8 @@ def _rounds(lights: Doubles) -> list[Integers]:
             first = last + 1
     inner = [steps[ring[:-1]] for ring in rings]
     in_order = bool(inner) and all((ring > 0).all() or (ring < 0).all() for ring in inner)
-    return rings if in_order and sum(map(len, rings)) > _IN_ROUNDS * len(lights) else []
+    # So many lights must be in rings that the azimuth goes round.
+    return rings if in_order and sum(map(len, rings)) > 0.8 * len(lights) else []
 
 
 def _readings(given: Doubles) -> Iterator[tuple[str, Doubles]]:
@@ -167,36 +166,28 @@ def _numbers(numbers: Integers) -> str:
     return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
 
 
-MIN_LIGHTS = 6  # fewer lights leave too few equations to judge their order
+@dataclass(frozen=True)
+class OrderLimits:
+    """Thresholds of the order of the lights. Misfits are shares of the median misfit of random orders."""
 
-BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
-"""Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
+    min_lights: int = 6  # fewer leave too few equations
+    better: float = 0.6  # the largest share of the given misfit that a better order leaves
+    better_of_few: float = 0.4  # the same for few lights
+    few: int = 8
+    mended: float = 0.35  # the largest misfit of a better order; right lights of most metals have less
+    wrong: float = 0.25  # the smallest misfit of a wrong order
+    swapped: float = 0.08  # the same where two lights are exchanged
+    for_chance: int = 8  # fewer lights fit in too many random orders; they use known intensities
+    random: float = 0.05  # of the brightness; below it, free intensities tell no order
+    residual: float = 0.2  # of the factors; with more, and few lights, metals fit like a random order
+    of_metal: int = 12  # from here on, metals are judged
+    half_left: float = 0.6  # half vectors: doubled angles leave at most this share
+    half_misfit: float = 0.04  # of a misfit above this,
+    half_worse: float = 0.05  # and are worse by at most this under any kind of intensities
 
-MAX_MENDED = 0.35
-"""Largest misfit of a better order, as a share of random orders'. Right lights of most metals have less."""
 
-MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
-"""Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
+ORDER = OrderLimits()
 
-MIN_RING_MISFIT, BETTER_RINGS = 0.1, 0.75
-"""The same for single rings of a dome, and the largest share of the misfit that is left when they are mended."""
-
-CHANCE = 0.02  # an order is wrong if more than this share of random orders fits as well
-
-MIN_LIGHTS_FOR_CHANCE = 8
-"""Fewer lights fit in too many random orders by chance. They are compared under known intensities, if there are any."""
-
-MIN_RANDOM_MISFIT = 0.05
-"""Smallest median misfit of random orders, as a share of the brightness, with which free intensities tell an order."""
-
-MAX_RESIDUAL, MIN_LIGHTS_OF_METAL = 0.2, 12
-"""With a larger residual of the factors and fewer lights, images of metal and of shiny hollows do not tell whether an
-order fits at all: their right lights may fit like a random order. Another order that fits much better is still named.
-"""
-
-UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
-"""An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
-could explain: highlights and shadows."""
 
 UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
 
@@ -206,24 +197,6 @@ ZENITH = "if their elevations count from the camera axis"
 HALF_VECTORS = "if they are half vectors, as the normals of a mirror ball at its highlights"
 """The reading of lights half-way between the true ones and the camera axis, in words."""
 
-FEWER_LEFT, MIN_HALF_MISFIT, WORSE_HALF_MISFIT = 0.6, 0.04, 0.05
-"""Lights are half vectors if doubled angles from the axis leave less than the first share of a misfit above the second,
-as a share of random orders', and under no kind of intensities are worse by the third. Of right lights, doubled angles
-leave at least as much, also where the values are encoded, or the lamps near."""
-
-HALF_IN_ALBEDO, MIN_HALF_SPREAD = 0.65, 0.1
-"""A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this share of the expected
-change of the albedo, lights are half vectors, if the logarithm of that change has at least this standard deviation.
-Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors, below 0.4 with right lights
-and below 0.5 with near lamps."""
-
-LOWEST_DOUBLED = 0.0  # z of a doubled direction; half vectors of lights above the horizon are within 45 degrees
-
-RANDOM_FIT = 0.7
-"""Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
-
-MAX_PLAIN_MISFIT, MAX_FREE_MISFIT = 0.5, 0.35
-"""Above these misfits under known and free intensities, as shares of random orders', normals are not plausible."""
 
 _FITTED_PIXELS, _FITTED_ORDERS, _FITS = 800, 9, 5
 
@@ -270,11 +243,11 @@ def check_order(
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))
-    if factors is None or len(lights) < MIN_LIGHTS:
+    if factors is None or len(lights) < ORDER.min_lights:
         return unknown
     compared, random = _free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
-    if usual < MIN_RANDOM_MISFIT and not factors.intensities_known:
+    if usual < ORDER.random and not factors.intensities_known:
         return unknown
     given = _Reading(None, lights, float(compared.misfits(lights[None])[0]))
     shifted = light_directions[shifted_orders(n_all)[:, chosen]]
@@ -285,32 +258,31 @@ def check_order(
     of_angles = _Reading(ZENITH, zenith, float(compared.misfits(zenith[None])[0]))
     tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
     doubled = lights_of_half_vectors(lights)
-    if doubled[:, 2].min() > LOWEST_DOUBLED:
+    # Half vectors of lights above the horizon are within 45 degrees of the axis.
+    if doubled[:, 2].min() > 0.0:
         tried.append(_Reading(HALF_VECTORS, doubled, float(compared.misfits(doubled[None])[0])))
-    limit = min(given.misfit * (BETTER_ORDER_OF_FEW if len(lights) <= FEW else BETTER_ORDER), MAX_MENDED * usual)
+    limit = min(
+        given.misfit * (ORDER.better_of_few if len(lights) <= ORDER.few else ORDER.better), ORDER.mended * usual
+    )
     best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
     if tried[-1].words == HALF_VECTORS and _are_half_vectors(observations, factors, lights, doubled):
         found = tried[-1]
-    elif share > MIN_MISFIT and best.misfit < limit:
+    elif share > ORDER.wrong and best.misfit < limit:
         found = best
-    elif share > MIN_SWAP_MISFIT and exchanged.misfit < limit:
+    elif share > ORDER.swapped and exchanged.misfit < limit:
         found = exchanged
-    if (
-        found.words != HALF_VECTORS
-        and found.misfit > MIN_RING_MISFIT * usual
-        and np.array_equal(chosen, np.arange(n_all))
-    ):
+    if found.words != HALF_VECTORS and found.misfit > 0.1 * usual and np.array_equal(chosen, np.arange(n_all)):
         rings = _Reading(*mend_rings(compared, lights))
         if rings.words:
             tried.append(rings)
-            if rings.misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
+            if rings.misfit < min(found.misfit * 0.75, ORDER.mended * usual):
                 found = rings
     # On glossy plates, intensities that may be any hide an order that fits well under the known ones.
     fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
     if found is given and not fits_known and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
     turns: tuple[Turn, ...] = ()
-    if any(found is shift for shift in shifts) or (found is given and share < MIN_MISFIT):
+    if any(found is shift for shift in shifts) or (found is given and share < ORDER.wrong):
         turns = _turns(found.lights, shifted, misfits <= max(1.3 * found.misfit, 0.05 * usual))
     return LightOrder(
         found.words,
@@ -331,9 +303,9 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, d
         compared = replace(factors, intensities_known=known)
         usual = float(np.median(random_misfits(compared, lights)))
         given, other = compared.misfits(np.stack((lights, doubled))) / max(usual, 1e-9)
-        if other > given + WORSE_HALF_MISFIT:
+        if other > given + ORDER.half_worse:
             return False
-        better |= bool(given > MIN_HALF_MISFIT and other < FEWER_LEFT * given)
+        better |= bool(given > ORDER.half_misfit and other < ORDER.half_left * given)
     return better or _brighten_as_half_vectors(observations, lights, doubled)
 
 
@@ -349,7 +321,11 @@ def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Do
     for _ in range(_FITS):
         solution = np.linalg.lstsq(weights[:, None] * terms, weights * albedo, rcond=None)[0]
         weights = np.sqrt(absolute_weights(albedo - terms @ solution))
-    return bool(solution[1] > HALF_IN_ALBEDO and change.std() > MIN_HALF_SPREAD)
+    # A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this share of the
+    # expected change of the albedo, lights are half vectors, if the logarithm of that change has at least this
+    # standard deviation. Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors,
+    # below 0.4 with right lights and below 0.5 with near lamps.
+    return bool(solution[1] > 0.65 and change.std() > 0.1)
 
 
 def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _Reading:
@@ -363,26 +339,30 @@ def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _
 def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Doubles) -> bool:
     """Return whether lights fit no better than those in random orders do, whose misfits are given."""
     n_lights = len(given.lights)
-    by_chance = n_lights >= MIN_LIGHTS_FOR_CHANCE and (random <= given.misfit).mean() > CHANCE
-    unfit = given.misfit > UNFIT_MISFIT * np.median(random) and given.misfit > UNFIT_RATIO * factors.residual
-    judged = factors.residual < MAX_RESIDUAL or n_lights >= MIN_LIGHTS_OF_METAL
+    # An order is wrong if more than this share of random orders fits as well.
+    by_chance = n_lights >= ORDER.for_chance and (random <= given.misfit).mean() > 0.02
+    # An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no
+    # lights could explain: highlights and shadows.
+    unfit = given.misfit > 0.5 * np.median(random) and given.misfit > 6.0 * factors.residual
+    judged = factors.residual < ORDER.residual or n_lights >= ORDER.of_metal
     return judged and bool(by_chance or unfit) and _fits_like_random(observations, factors, given.lights)
 
 
 def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
     """Return whether lights fit well enough for the normals to tell an outline."""
     if not fitted.intensities_known:
-        return found.misfit <= MAX_FREE_MISFIT * usual
+        return found.misfit <= 0.35 * usual
     random, misfit = random_misfits(fitted, found.lights), fitted.misfits(found.lights[None])[0]
-    return bool(misfit <= MAX_PLAIN_MISFIT * max(float(np.median(random)), 1e-9))
+    # Above these misfits, under free and under known intensities, normals are not plausible.
+    return bool(misfit <= 0.5 * max(float(np.median(random)), 1e-9))
 
 
 def _free_if_possible(factors: Factors, lights: Doubles) -> tuple[Factors, Doubles]:
     """Return factors that are compared with lights of any intensities, if these tell orders, and random misfits."""
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
-    few = factors.intensities_known and len(lights) < MIN_LIGHTS_FOR_CHANCE
-    if few or np.median(random) < MIN_RANDOM_MISFIT:
+    few = factors.intensities_known and len(lights) < ORDER.for_chance
+    if few or np.median(random) < ORDER.random:
         return factors, random_misfits(factors, lights) if factors.intensities_known else random
     return free, random
 
@@ -396,7 +376,8 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -
     orders = np.stack((lights, *(rng.permutation(lights) for _ in range(_FITTED_ORDERS))))
     intensities = factors.intensities(orders)
     given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
-    return given > RANDOM_FIT * float(np.median(random))
+    # Lights whose residual is below this share of that in random orders are not said to be in a wrong order.
+    return given > 0.7 * float(np.median(random))
 
 
 def _turns(lights: Doubles, shifted: Doubles, fitting: Bools) -> tuple[Turn, ...]:

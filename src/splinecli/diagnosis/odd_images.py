@@ -27,21 +27,18 @@ from splinecli.lights.rough_normals import rough_normals
 from splinecli.maths import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import angle_between_deg
 
-MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
-MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness
 
-ODD_MISFIT, OTHER_MISFIT = 0.35, 0.75
-"""Largest misfit without the odd image, and smallest one without any other, as shares of that of all images."""
+@dataclass(frozen=True)
+class OddImageLimits:
+    """Thresholds of the check for a single image that contradicts the others."""
 
-MIN_RESIDUAL, RESIDUAL_RATIO = 0.25, 2.5
-"""An odd image's residual is above the first, as a share of its brightness, and this many times that of any other."""
+    min_lights: int = 10  # with fewer, a right image may seem odd by chance
+    min_misfit: float = 0.04  # of lights, one of whose images is odd, as a share of the brightness
+    residual: float = 0.2  # of the factors; with more, as on metals, misfits tell nothing
+    of_others: float = 0.15  # the same of the other images, for residuals
 
-MAX_RESIDUAL, MAX_OTHER_RESIDUAL = 0.2, 0.15
-"""Where the factors leave more of all images, as on metals, misfits tell nothing; the second is for residuals, of the
-other images."""
 
-OTHER_BRIGHTNESS = 0.3
-"""Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image."""
+ODD = OddImageLimits()
 
 
 @dataclass(frozen=True)
@@ -56,21 +53,24 @@ class OddImage:
 
 def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | None:
     """Return the image that contradicts the others under lights (F, 3), or None."""
-    if len(light_directions) < MIN_LIGHTS:
+    if len(light_directions) < ODD.min_lights:
         return None
     kinds = [factors] if factors.intensities_known else []
     for compared in (*kinds, factors.with_free_intensities()):
         shares = _shares_left(compared, light_directions)
         first, second = np.argsort(shares)[:2]
-        alone = shares[first] < ODD_MISFIT and shares[second] > OTHER_MISFIT
-        if alone and factors.residual < MAX_RESIDUAL:
+        # Largest misfit without the odd image, and smallest one without any other, as shares of that of all images.
+        alone = shares[first] < 0.35 and shares[second] > 0.75
+        if alone and factors.residual < ODD.residual:
             brightness = _brightness(compared, light_directions, int(first))
             return OddImage(int(first), float(shares[first]), brightness)
     residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
     second, first = np.argsort(residuals)[-2:]
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
-    stands_out = residuals[first] > max(MIN_RESIDUAL, RESIDUAL_RATIO * residuals[second])
-    if stands_out and left < MAX_OTHER_RESIDUAL:
+    # An odd image's residual is above the first, as a share of its brightness, and this many times that of any
+    # other.
+    stands_out = residuals[first] > max(0.25, 2.5 * residuals[second])
+    if stands_out and left < ODD.of_others:
         return OddImage(int(first), left / factors.residual)
     return None
 
@@ -79,7 +79,7 @@ def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
     """Return the mean square misfits (F,) without each image, as roots of their shares of that of all images."""
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
-    if misfit < MIN_MISFIT:
+    if misfit < ODD.min_misfit:
         return np.ones(n_lights)
     without = np.repeat(light_directions[None], n_lights, axis=0)
     diagonal = np.arange(n_lights)
@@ -97,22 +97,22 @@ def _brightness(factors: Factors, light_directions: Doubles, place: int) -> floa
     predicted, found = light_directions[place] @ fit, factors.matrix[:, place]
     brightness = float(found @ predicted / max(predicted @ predicted, 1e-12))
     misfit = np.linalg.norm(found - brightness * predicted) / max(float(np.linalg.norm(found)), 1e-12)
-    return brightness if brightness > 0 and misfit < OTHER_BRIGHTNESS else None
+    # Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image.
+    return brightness if brightness > 0 and misfit < 0.3 else None
 
 
-LARGEST = 8  # largest shift that is looked for, in pixels of the sample
+@dataclass(frozen=True)
+class ShiftLimits:
+    """Thresholds of the check for images whose detail is shifted."""
 
-LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
-"""A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
-images and more, a polished metal reached 0.44 and 0.17."""
+    largest: int = 8  # the largest shift that is looked for, in pixels of the sample
+    least_images: int = 10  # from fewer, polished metals are predicted so badly that right images are named
+    least_pixels: int = 1000  # that must stay in the mask under every shift
+    predictors: int = 5  # an image is predicted from three factors of four others or more
+    most_detail: float = 4.0  # in local contrasts: highlights count no more
 
-LEAST_SHIFT = 0.8  # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
-LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
-LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
-_MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
-_DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
-_LIMIT = 4.0  # of detail, in local contrasts: highlights count no more
-_FAINT = 0.05  # share of the mean contrast below which detail fades out
+
+SHIFT = ShiftLimits()
 
 
 class ImageShift(NamedTuple):
@@ -132,7 +132,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
     values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
     inner = _inner(sample.mask)
-    if values.shape[1] < LEAST_IMAGES or np.count_nonzero(inner) < LEAST_PIXELS:
+    if values.shape[1] < SHIFT.least_images or np.count_nonzero(inner) < SHIFT.least_pixels:
         return []
     values = values / np.maximum(values.mean(axis=0), 1e-9)
 
@@ -144,7 +144,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     found = shifts_against(range(values.shape[1]))
     still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
     # A shifted image also disturbs the prediction of others.
-    return shifts_against(still) if found and len(still) >= _MIN_PREDICTORS else found
+    return shifts_against(still) if found and len(still) >= SHIFT.predictors else found
 
 
 def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles]:
@@ -152,9 +152,9 @@ def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles
     products = values.T @ values
     for place in range(len(products)):
         others = [other for other in predictors if other != place]  # no image predicts itself
-        strengths, directions = np.linalg.eigh(products[np.ix_(others, others)])
+        eigenvalues, directions = np.linalg.eigh(products[np.ix_(others, others)])
         weights = np.zeros((len(products), 3), np.float32)
-        weights[others] = directions[:, -3:] / np.sqrt(np.maximum(strengths[-3:], 1e-12))
+        weights[others] = directions[:, -3:] / np.sqrt(np.maximum(eigenvalues[-3:], 1e-12))
         factors = values @ weights
         yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
 
@@ -164,12 +164,18 @@ def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> t
     detail, expected = _detail(image, mask), _detail(predicted, mask)
     correlations = _correlations(detail, expected, inner)
     right, down = _peak(correlations)
-    peak, unmoved = correlations[LARGEST + down, LARGEST + right], correlations[LARGEST, LARGEST]
-    at_edge = max(abs(right), abs(down)) == LARGEST  # the peak may lie beyond
-    if at_edge or peak < LEAST_CORRELATION or peak - unmoved < LEAST_GAIN:
+    peak, unmoved = (
+        correlations[SHIFT.largest + down, SHIFT.largest + right],
+        correlations[SHIFT.largest, SHIFT.largest],
+    )
+    at_edge = max(abs(right), abs(down)) == SHIFT.largest  # the peak may lie beyond
+    # A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of
+    # ten images and more, a polished metal reached 0.44 and 0.17.
+    if at_edge or peak < 0.2 or peak - unmoved < 0.2:
         return None
-    around = correlations[LARGEST + down - 1 :, LARGEST + right - 1 :][:3, :3]
-    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < LEAST_SHIFT:
+    around = correlations[SHIFT.largest + down - 1 :, SHIFT.largest + right - 1 :][:3, :3]
+    # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
+    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
         return None
     # A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
     for half in _halves(inner):
@@ -180,10 +186,10 @@ def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> t
 
 
 def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles:
-    """Return the correlations of two images (H, W) at shifts down and right from -LARGEST to LARGEST."""
+    """Return the correlations of two images (H, W) at shifts down and right up to SHIFT.largest."""
     import cv2
 
-    most = slice(LARGEST, -LARGEST)
+    most = slice(SHIFT.largest, -SHIFT.largest)
     template, weights = (np.ascontiguousarray(part[most, most]) for part in (expected, inner))
     found = cv2.matchTemplate(detail, template, cv2.TM_CCORR_NORMED, mask=weights)
     return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
@@ -191,7 +197,7 @@ def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles
 
 def _peak(correlations: Singles) -> tuple[int, int]:
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
-    return int(right) - LARGEST, int(down) - LARGEST
+    return int(right) - SHIFT.largest, int(down) - SHIFT.largest
 
 
 def _halves(inner: Singles) -> Iterator[Singles]:
@@ -218,32 +224,38 @@ def _detail(values: Singles, mask: Bools) -> Singles:
 
     image = np.zeros(mask.shape, np.float32)
     image[mask] = values
-    detail = (image - blur(image, _DETAIL)) * inside
-    contrast = blur(np.abs(detail), _CONTRAST)
-    detail /= contrast + _FAINT * np.abs(detail[mask]).mean() + np.float32(1e-12)
-    return np.asarray(detail.clip(-_LIMIT, _LIMIT), np.float32)
+    # Finer detail, and local contrast
+    detail = (image - blur(image, 1.5)) * inside
+    contrast = blur(np.abs(detail), 4.0)
+    # Detail fades out below this share of the mean contrast.
+    detail /= contrast + 0.05 * np.abs(detail[mask]).mean() + np.float32(1e-12)
+    return np.asarray(detail.clip(-SHIFT.most_detail, SHIFT.most_detail), np.float32)
 
 
 def _inner(mask: Bools) -> Singles:
     """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
     import cv2
 
-    shifts = np.ones((2 * LARGEST + 1, 2 * LARGEST + 1), np.uint8)
+    shifts = np.ones((2 * SHIFT.largest + 1, 2 * SHIFT.largest + 1), np.uint8)
     return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))
 
 
-MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
-"""A ground truth is in another frame if its median angle to the rough normals is above the first, and another frame
-leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
+@dataclass(frozen=True)
+class TruthLimits:
+    """Thresholds of the check of the ground truth."""
 
-REACH = 0.15  # the largest shift that is looked for, as a share of the smaller side of the object
-SHIFT_LEFT, SHIFT_FALL_DEG = 0.65, 1.5
-"""A ground truth is shifted if a shift leaves at most this share of the median angle, and takes so much from it. It
-must also leave less than this share of what a rotation leaves: lights that are all tilted turn the normals of a ball
-nearly as a shift does."""
+    angle_deg: float = 20.0  # to the rough normals in another frame; metals reach 30 degrees in the right one
+    left: float = 0.5  # another frame leaves at most this share of the angle
+    reach: float = 0.15  # the largest shift, as a share of the smaller side of the object
+    shift_left: float = 0.65  # a shift leaves less of the angle, and of what a rotation leaves: on balls they are alike
+    fall_deg: float = 1.5  # and takes so much from it
+    most_pixels: int = 4000  # of each comparison
+
+
+TRUTH = TruthLimits()
+
 
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
-_MOST_PIXELS = 4000  # of each comparison
 
 
 def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
@@ -260,24 +272,24 @@ def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats 
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals
     angles = [float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES]
     best = int(np.argmin(angles))
-    if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
+    if angles[0] <= TRUTH.angle_deg or angles[best] > TRUTH.left * angles[0]:
         return _shifted(normals, truth, sample)
     frame = _FRAMES[best]
-    code, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
+    kind, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
     if frame.signs[2] < 0:
-        code, lights = codes.GROUND_TRUTH_Z, ""
+        kind, lights = codes.GROUND_TRUTH_Z, ""
     text = (
         f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
         f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
     )
     # Either the ground truth or the normals are wrong by this angle.
-    return [CaptureWarning(code, text, angles[0] if code == codes.GROUND_TRUTH_FRAME else None)]
+    return [CaptureWarning(kind, text, angles[0] if kind == codes.GROUND_TRUTH_FRAME else None)]
 
 
 def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWarning]:
     """Warn of a ground truth (h, w, 3) that fits normals (h, w, 3) much better when it is moved."""
     rows, columns = np.nonzero(sample.mask)
-    reach = max(1, round(REACH * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
+    reach = max(1, round(TRUTH.reach * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
     # Coarse to fine: the angle changes slowly with the shift.
     right, down, step = 0, 0, max(1, reach // 4)
     angles: dict[tuple[int, int], tuple[float, float]] = {}
@@ -291,10 +303,10 @@ def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWar
         right, down = min(angles, key=lambda moved: angles[moved][0] - angles[moved][1])
         step //= 2
     after, before = angles[right, down]
-    if (right, down) == (0, 0) or before - after < SHIFT_FALL_DEG or after > SHIFT_LEFT * before:
+    if (right, down) == (0, 0) or before - after < TRUTH.fall_deg or after > TRUTH.shift_left * before:
         return []
     known = normals.any(axis=2) & truth.any(axis=2)
-    if after > SHIFT_LEFT * _rotated_angle_deg(normals[known], truth[known]):
+    if after > TRUTH.shift_left * _rotated_angle_deg(normals[known], truth[known]):
         return []
     directions = ((right, "right", "left"), (down, "down", "up"))
     named = " and ".join(
@@ -324,7 +336,7 @@ def _angles_deg(normals: Doubles, truth: Floats, shift: tuple[int, int]) -> tupl
     known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
     if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
         return 180.0, 0.0
-    every = slice(None, None, -(-int(np.count_nonzero(known)) // _MOST_PIXELS))
+    every = slice(None, None, -(-int(np.count_nonzero(known)) // TRUTH.most_pixels))
     own = normals[here][known][every]
     after, before = (float(np.median(angle_between_deg(own, other[known][every]))) for other in (moved, truth[here]))
     return after, before

@@ -10,8 +10,6 @@ real materials, none of which is matte, are worth. Both were fitted to captures 
 without these faults (benchmarks/capture_faults.py --fit).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -37,38 +35,32 @@ COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensi
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
 
 EIGHT_BIT = 0.8  # taken off the cost of a curve where images of 8 bits do not say that they are linear
-EQUAL_COST, EQUAL_SPREAD = 10.0, 0.15
-"""Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by the
-standard deviation of their logarithms."""
 
-ROUND, ROUND_COST = 0.85, 1.9
-"""On a ball, gloss varies with the place as the light of near lamps does. An object is round if its normals predict
-this share of the variance of the places; then near lamps cost so much more."""
 
-END_COST = 1.3  # of a distance at an end of WIDTHS, where the residual may fall beyond
-
-VARIED_SPREAD, FLAT_POWER = 0.3, 0.45
-"""Spread of the normals (their second largest standard deviation) from which powers count in full, and the share of
-them that counts for a plate."""
-
-FEW_POWER = 0.6  # share of the power under four or five lights
-UNEQUAL_RESIDUAL = 0.06  # of a flat object under lamps that differ by 20 %; gloss leaves less
-
-_TOLD_APART = 0.3  # share of the probability of the likeliest reading from which another is named beside it
 LIKELY = 0.5  # probability from which a reading is named
 
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
-_MIN_LIGHTS, _LIGHTS_FOR_MEDIAN = 4, 8
-_MAX_PIXELS, _MAX_OBSERVATIONS, _MIN_PIXELS = 400, 16_000, 60
-_DARK_SHARE = 0.1  # of the brightest hundredth of the pixels; darker ones are background
-_SHADOW = 0.1  # share of a pixel's largest value; smaller values are shadow
-_ENCODED_SHADOW = 0.35  # the same if values are encoded
-_FITS, _FREE_FITS, _OFFSET_FITS = 8, 30, 14
-_HALVINGS = 3  # of the interval around the best constant light
-_USUAL_COSINE = 0.8  # between a normal and the light under which its pixel is brightest
-_STEP = 1.5  # exponent of each change of intensities, which saves a third of the fits
-_SAME_VALUE, _CLIPPED_SHARE = 1e-5, 1e-3  # of values that are saturated, and of all values
-_LEAST = 1e-4  # added to residuals; 16 bits do not go below it
+
+
+@dataclass(frozen=True)
+class FitLimits:
+    """How readings are fitted; see Readings."""
+
+    min_lights: int = 4
+    for_median: int = 8  # from here on, the median residual is typical, else the mean
+    max_pixels: int = 400
+    max_observations: int = 16_000
+    min_pixels: int = 60
+    dark: float = 0.1  # of the brightest hundredth of the pixels; darker ones are background
+    shadow: float = 0.1  # of a pixel's largest value; smaller values are shadow
+    fits: int = 8
+    free_fits: int = 30  # with free intensities
+    offset_fits: int = 14  # with constant light
+    step: float = 1.5  # the exponent of each change of intensities, which saves a third of the fits
+    least: float = 1e-4  # added to residuals; 16 bits do not go below it
+
+
+FIT = FitLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,19 +104,22 @@ class Readings:
         self, sample: Sample, lights: Doubles, intensities: Doubles | None = None, *, eight_bit: bool = False
     ) -> None:
         n_lights = len(lights)
-        chosen, values = lit_values(sample.observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
-        clipped = sample.observations[chosen] >= (1 - _SAME_VALUE) * sample.observations.max()
+        chosen, values = lit_values(
+            sample.observations, FIT.dark, min(FIT.max_pixels, FIT.max_observations // n_lights)
+        )
+        # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
+        clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
         # Values at full scale look like a curve. As shadows, they do not count.
-        if clipped.sum() > _CLIPPED_SHARE * clipped.size:
+        if clipped.sum() > 1e-3 * clipped.size:
             values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
-        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
+        enough = (values > FIT.shadow).sum(axis=1) >= min(5, n_lights)
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
         self.shape, self.eight_bit = sample.mask.shape, eight_bit
-        self.are_enough = n_lights >= _MIN_LIGHTS and len(self.values) >= _MIN_PIXELS
+        self.are_enough = n_lights >= FIT.min_lights and len(self.values) >= FIT.min_pixels
 
     def fit(self, kinds: Collection[Kind]) -> list[Reading]:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
@@ -170,7 +165,8 @@ class Readings:
         if not ranked:
             return None
         best = max((reading for reading in found if reading.kind == ranked[0]), key=lambda reading: reading.evidence)
-        others = [kind for kind in ranked[1:] if shares[kind] > _TOLD_APART * shares[ranked[0]]]
+        # Readings that are this likely, compared with the likeliest one, are named beside it.
+        others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
         return Doubt(best, sum(shares.values()), tuple(others))
 
     def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
@@ -183,7 +179,7 @@ class Readings:
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
     def _best_curve(self, *, free: bool = False) -> Reading:
-        vectors, shadow = self._with(self.lights), _ENCODED_SHADOW
+        vectors, shadow = self._with(self.lights), 0.35  # encoded shadows are brighter
         given = _fit(self.values, vectors, free=free, shadow=shadow)
         fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in EXPONENTS}
         return _best("curve", fits, given, -EIGHT_BIT if self.eight_bit else 0.0)
@@ -193,14 +189,17 @@ class Readings:
         fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        cost = ROUND_COST if _roundness(best.normals, places) > ROUND else 0.0
-        cost += END_COST if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0.0
+        # On a ball, gloss varies with the place as the light of near lamps does. An object is round if its normals
+        # predict this share of the variance of the places; then near lamps cost so much more.
+        cost = 1.9 if _roundness(best.normals, places) > 0.85 else 0.0
+        # At an end of WIDTHS, the residual may fall beyond.
+        cost += 1.3 if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0.0
         return replace(best, evidence=best.evidence - cost)
 
     def _offset_fits(self, vectors: Doubles) -> dict[float, _Fit]:
         """Return fits with constant light, also between the two of OFFSETS around the best one."""
         fits = {offset: _fit(self.values, vectors, offset=offset) for offset in OFFSETS}
-        for _ in range(_HALVINGS):
+        for _ in range(3):  # halve the interval around the best constant light
             tried = sorted(fits)
             best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
             for one, other in pairwise(tried[max(best - 1, 0) : best + 2]):
@@ -224,19 +223,24 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     """
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
-    ratio = (found.residual + _LEAST) / (given.residual + _LEAST)
+    ratio = (found.residual + FIT.least) / (given.residual + FIT.least)
     power = POWERS[kind]
     if len(given.intensities) < _LEAST_LIGHTS["curve"]:
-        power *= FEW_POWER
-    if kind != "intensities" or given.residual < UNEQUAL_RESIDUAL:
+        power *= 0.6  # four or five lights
+    # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
+    if kind != "intensities" or given.residual < 0.06:
         spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
-        power *= float(np.clip(spread / VARIED_SPREAD, FLAT_POWER, 1))
+        # Spread of the normals (their second largest standard deviation) from which powers count in full, and the
+        # share of them that counts for a plate.
+        power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 
 def _cost_of_equal(intensities: Doubles) -> float:
-    return float(EQUAL_COST * np.exp(-((np.std(np.log(intensities)) / EQUAL_SPREAD) ** 2)))
+    # Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by
+    # the standard deviation of their logarithms.
+    return float(10.0 * np.exp(-((np.std(np.log(intensities)) / 0.15) ** 2)))
 
 
 def _fit(
@@ -246,7 +250,7 @@ def _fit(
     *,
     offset: float = 0.0,
     free: bool = False,
-    shadow: float = _SHADOW,
+    shadow: float = FIT.shadow,
 ) -> _Fit:
     """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
 
@@ -258,9 +262,10 @@ def _fit(
     weights = start = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1))
     intensities = np.ones(values.shape[1])
     if offset:
-        above = np.maximum(observed - offset / (offset + _USUAL_COSINE), 0)
+        # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
+        above = np.maximum(observed - offset / (offset + 0.8), 0)
         normals = fit_scaled_normals(above, start, lights)
-    for _ in range(_OFFSET_FITS if offset else _FREE_FITS if free else _FITS):
+    for _ in range(FIT.offset_fits if offset else FIT.free_fits if free else FIT.fits):
         if offset:
             facing = (shade(normals, lights) > 0)[..., None]
             # Newton's step on |b|, halved: with much constant light, whole steps miss.
@@ -275,7 +280,7 @@ def _fit(
             intensities = _intensities(observed, predicted / intensities, weights, intensities)
     residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
     # The fits to few lights pass through most values. The median would be zero.
-    typical = np.median(residuals) if values.shape[1] >= _LIGHTS_FOR_MEDIAN else residuals.mean()
+    typical = np.median(residuals) if values.shape[1] >= FIT.for_median else residuals.mean()
     return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
 
 
@@ -285,7 +290,7 @@ def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Do
     power = (weights * equal**2).sum(axis=0)
     found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
     found = np.clip(found / found.mean(), 0.05, 20)
-    intensities = before * (found / before) ** _STEP
+    intensities = before * (found / before) ** FIT.step
     return np.asarray(intensities / intensities.mean())
 
 

@@ -6,6 +6,7 @@ ball, moved shading and a moved lamp differ only near the outline and by the sha
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,31 +15,30 @@ from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import fit_robustly, inverse_3x3, multiply_symmetric
 from splinecli.maths import Bools, Doubles
 
-REACH, COUNTED = 0.2, 0.75
-"""Shifts are compared up to this share of the smaller side of the object, and count up to that share of it: where a
-model is wrong in another way, the residual often falls on and on."""
 
-LEAST_FALL, MOST_LEFT, MOST_LEFT_OF_FEW = 0.03, 0.5, 0.35
-"""A shift counts if the residual falls by the first, as a share of the image's brightness, and to the second or less of
-what it was: in the whole image, and in most halves of it. With fewer than MANY_IMAGES it is the third: gloss on a
-rendered sphere under eight lights reached 0.4."""
+@dataclass(frozen=True)
+class ShadingLimits:
+    """Thresholds of shifts that shading shows. Falls and residuals are shares of the image's brightness."""
 
-OF_MANY, REACH_OF_MANY = (0.02, 0.6), 0.1
-"""The same two for half of the images, against the other half, and the largest shift of it, as a share of the smaller
-side. On a photographed glossy ball, five of ten images fitted better when they were moved by a sixth of its width."""
+    reach: float = 0.2  # shifts are compared up to this share of the smaller side of the object,
+    counted: float = 0.75  # and count up to this share of it: wrong models often improve on and on
+    fall: float = 0.03  # the residual falls by so much,
+    left: float = 0.5  # and to this share, in the whole image and most halves of it
+    left_of_few: float = 0.35  # with fewer images: gloss on a rendered sphere under eight lights reached 0.4
+    of_half: tuple[float, float] = (0.02, 0.6)  # the same two for half of the images
+    reach_of_half: float = 0.1  # on a photographed ball, half fitted better when moved by a sixth
+    least_images: int = 8
+    many_images: int = 10
+    least_pixels: int = 300
+    residual: float = 0.6  # the model says nothing of metals, which leave more
+    kept: float = 0.3  # least share of the pixels that are neither in shadow nor highlights
+    overlap: float = 0.5  # share of the largest overlap
 
-OUTSTANDING = 2.0
-"""The residual of a shifted image is so many times that of the better images, of which a quarter have less. Where the
-model fits no image well, as on polished balls, it does not say which is shifted."""
 
-LEAST_IMAGES, MANY_IMAGES = 8, 10
-LEAST_PIXELS = 300
+LIMITS = ShadingLimits()
 
-MOST_RESIDUAL = 0.6  # of the brightness; the model says nothing of metals, which leave more
-_LEAST_KEPT, _LEAST_OVERLAP = 0.3, 0.5
+
 _DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and what is added to it
-_WILD = 4.0  # length of scaled normals where a bright value is 1: these are extrapolated from few lit images
-_MOST_VALUES = 200_000  # of pixels and images; beyond, rows and columns are left out
 _PASSES, _FITS = 2, 5
 
 Shift = tuple[int, int]  # right, down
@@ -48,22 +48,23 @@ _NO_SHIFT = 0.0, (0, 0)
 
 def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift]:
     """Return the shifts in pixels of the sample of images that are shifted, by place, under lights (F, 3)."""
-    stride = int(np.ceil(np.sqrt(sample.observations.size / _MOST_VALUES)))
+    # Rows and columns of larger captures are left out.
+    stride = int(np.ceil(np.sqrt(sample.observations.size / 200_000)))
     mask = sample.mask[::stride, ::stride]
-    if len(light_directions) < LEAST_IMAGES or np.count_nonzero(mask) < LEAST_PIXELS:
+    if len(light_directions) < LIMITS.least_images or np.count_nonzero(mask) < LIMITS.least_pixels:
         return {}
     images = np.zeros((len(light_directions), *sample.mask.shape))
     images[:, sample.mask] = sample.observations.T
     model = _MatteModel(images[:, ::stride, ::stride], mask, light_directions)
     n_images = len(images)
-    halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= MANY_IMAGES else ()
+    halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= LIMITS.many_images else ()
     together = []
     for half in halves:
         others = [place for place in range(n_images) if place not in half]
         of_half = _MatteModel(model.images, mask, light_directions, half)
         together.append((*of_half.find_common(others, of_half.usual_residual(half)), others))
     fall, shift, others = max(together, default=(0.0, (0, 0), []))
-    farthest = REACH_OF_MANY * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))
+    farthest = LIMITS.reach_of_half * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))
     for place in others if fall > 0 and max(map(abs, shift)) <= farthest else ():
         model.move(place, shift)
     usual = model.usual_residual(range(n_images))
@@ -104,7 +105,7 @@ class _MatteModel:
     ) -> None:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
-        self.reach = max(2, round(REACH * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
+        self.reach = max(2, round(LIMITS.reach * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
         self._values = images[:, mask].T.copy()
         self._known = np.zeros(self._values.shape, np.bool_)
         self._known[:, slice(None) if fitted is None else list(fitted)] = True
@@ -135,7 +136,8 @@ class _MatteModel:
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
         amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
         normals = self._normals - turn * amount[:, None]
-        return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < _WILD, normals, 0.0)
+        # Where a bright value is 1, longer scaled normals are extrapolated from few lit images.
+        return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 4.0, normals, 0.0)
 
     def _compared(self, place: int) -> _Compared | None:
         """Return how the model fits an image at all shifts; None if it says nothing of this image.
@@ -146,7 +148,7 @@ class _MatteModel:
         predicted, values = np.maximum(normals @ self.lights[place], 0), image / self._top
         shadow = (values < _DARK) & (predicted < 2 * _DARK)
         kept = ~shadow & (values <= _HIGHLIGHT[0] * predicted + _HIGHLIGHT[1])
-        if kept.mean() < _LEAST_KEPT:
+        if kept.mean() < LIMITS.kept:
             return None
         good, scaled = self._map(np.asarray(normals.any(axis=1))), self._map(normals * self._top[:, None])
         kept, image = self._map(kept), self._map(image * kept)
@@ -160,7 +162,7 @@ class _MatteModel:
             self._sums(good * image**2, self.mask),
         )
         brightness = max(float(np.sqrt((image**2).sum() / kept.sum())), 1e-12)
-        enough = overlap > _LEAST_OVERLAP * overlap.max()
+        enough = overlap > LIMITS.overlap * overlap.max()
         left, unmoved = (np.where(enough, values / brightness, np.inf) for values in (left, unmoved))
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
@@ -175,9 +177,9 @@ class _MatteModel:
         compared = self._compared(place)
         if compared is None:
             return _NO_SHIFT
-        most_left = MOST_LEFT if len(self.images) >= MANY_IMAGES else MOST_LEFT_OF_FEW
-        fall, shift = _least(compared.left, compared.unmoved, LEAST_FALL, most_left, usual)
-        return (fall, shift) if fall and self._left_in_halves(*compared.maps, shift) <= MOST_LEFT else _NO_SHIFT
+        most_left = LIMITS.left if len(self.images) >= LIMITS.many_images else LIMITS.left_of_few
+        fall, shift = _least(compared.left, compared.unmoved, LIMITS.fall, most_left, usual)
+        return (fall, shift) if fall and self._left_in_halves(*compared.maps, shift) <= LIMITS.left else _NO_SHIFT
 
     def find_common(self, places: Sequence[int], usual: float) -> tuple[float, Shift]:
         """Return the same for images that may all have the same shift."""
@@ -188,7 +190,7 @@ class _MatteModel:
             shares = np.median([each.left / each.unmoved for each in found], axis=0)
         unmoved = np.median([each.unmoved for each in found], axis=0)
         known = np.isfinite(shares) & np.isfinite(unmoved)
-        return _least(np.where(known, shares * unmoved, np.inf), unmoved, *OF_MANY, usual)
+        return _least(np.where(known, shares * unmoved, np.inf), unmoved, *LIMITS.of_half, usual)
 
     def _left_in_halves(self, scaled: Doubles, good: Doubles, kept: Doubles, image: Doubles, shift: Shift) -> float:
         """Return the median share that a shift leaves in the upper, lower, left and right half.
@@ -232,9 +234,11 @@ def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float,
     """Return by how much the residual falls at the shift that leaves the smallest share of it; residuals are (h, w)."""
     reach = len(left) // 2
     around = np.abs(np.arange(-reach, reach + 1))
-    near = np.maximum(around[:, None], around) <= COUNTED * reach
+    near = np.maximum(around[:, None], around) <= LIMITS.counted * reach
     with np.errstate(invalid="ignore"):
-        counts = near & (unmoved - left >= least_fall) & (unmoved <= MOST_RESIDUAL) & (unmoved >= OUTSTANDING * usual)
+        # The residual of a shifted image is so many times that of the better images, of which a quarter have less.
+        # Where the model fits no image well, as on polished balls, it does not say which is shifted.
+        counts = near & (unmoved - left >= least_fall) & (unmoved <= LIMITS.residual) & (unmoved >= 2.0 * usual)
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]
     row, column = np.unravel_index(int(shares.argmin()), shares.shape)

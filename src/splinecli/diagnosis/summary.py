@@ -17,9 +17,6 @@ from splinecli.restoration.images import Saturation, WhiteLevel, find_object, fi
 
 MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
-BLACK = 0.15  # a background is dark if its median brightness is below this share of the object's
-
-_SMALLEST_SIDE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +72,20 @@ def leave_out_background(sample: Sample) -> tuple[Sample, float]:
 
     A sample that has a mask, or no dark background, is returned as it is.
     """
-    if not sample.mask.all() or min(sample.mask.shape) < _SMALLEST_SIDE:
+    if not sample.mask.all() or min(sample.mask.shape) < 8:
         return sample, 0.0
     brightness = sample.observations.mean(axis=1).reshape(sample.mask.shape).astype(np.float32)
     try:
         inside = find_object(brightness)
     except InputError:
         return sample, 0.0
-    if np.median(brightness[~inside]) > BLACK * np.median(brightness[inside]):
+    # A background is dark if its median brightness is below this share of the object's.
+    if np.median(brightness[~inside]) > 0.15 * np.median(brightness[inside]):
         return sample, 0.0
     return Sample(sample.observations[inside.ravel()], inside, sample.step), float(1 - inside.mean())
 
 
 DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
-_FULL_SCALE = 65_535  # of 16-bit files
 FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
 NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the camera axis carries a warning
 _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
@@ -152,12 +149,12 @@ class CaptureSummary:
             text = (
                 f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis; lower lights give better normals."
             )
-            found.append(CaptureWarning(codes.HIGH_LIGHTS, text))
+            found.append(CaptureWarning(codes.LIGHTS_NEAR_AXIS, text))
         return found
 
     def _dark_images(self, dark: Sequence[ImageSummary]) -> CaptureWarning:
         level = (1 << self.bits) - 1 if self.bits else 0
-        used = max(image.bright for image in self.images) * _FULL_SCALE / max(level, 1)
+        used = max(image.bright for image in self.images) * 65_535 / max(level, 1)  # of 16-bit files
         if level and used >= DARK:
             text = (
                 f"No value is above {level}, as from a camera of {self.bits} bits in 16-bit files. Of this range, the"

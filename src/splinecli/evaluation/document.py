@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
-from splinecli.capture.files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.documents import ComparisonReport, ProtocolReport
 from splinecli.errors import printable
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
@@ -41,6 +40,7 @@ from splinecli.evaluation.tables import (
     table_rows,
     trial_averages,
 )
+from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
 

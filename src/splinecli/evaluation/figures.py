@@ -24,7 +24,7 @@ from splinecli.evaluation.run import draws_for, read_draws_file
 from splinecli.evaluation.tables import AVERAGE, trial_averages
 from splinecli.evaluation.trials import Trial, TrialSource
 from splinecli.inference import estimate_normals
-from splinecli.methods import Estimator
+from splinecli.methods import METHODS, Estimator
 from splinecli.pictures.plots import method_maps, method_styles, observation_map_figure, png_bytes
 from splinecli.system.files import free_name
 
@@ -39,7 +39,6 @@ _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
 _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
-_NEAREST_TICKS = 0.045  # share of the axis: labels that are closer would overlap
 
 
 def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
@@ -154,7 +153,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     span = max(place.values()) - min(place.values())
     labels, last = [], -math.inf
     for x, position in place.items():
-        fits = position - last > _NEAREST_TICKS * span
+        fits = position - last > 0.045 * span  # share of the axis: labels that are closer would overlap
         labels.append(ticks[x] if fits else "")
         last = position if fits else last
     axes.set_xticks(list(place), labels)
@@ -165,7 +164,6 @@ SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
 
 MAPS = "_observation_maps"
-MOST_LISTED = 16  # largest number of lights that a title lists
 
 
 class CaptureFigure(NamedTuple):
@@ -213,11 +211,12 @@ def capture_figures(
         )
         assert estimate.error_map_deg is not None
         normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
-    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= MOST_LISTED else ""
+    # A title lists at most so many lights.
+    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
-    network = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
+    network = next((each for each in estimators if has_observation_maps(each.name)), None)
     # Under near lamps, or before a near camera, each pixel has light directions of its own.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
@@ -229,7 +228,7 @@ def capture_figures(
 
 def has_observation_maps(method: str) -> bool:
     """Return whether a method has observation maps that figures can show."""
-    return method.startswith("spline-net")
+    return method in METHODS and METHODS[method].observation_maps
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -253,9 +252,6 @@ def _observation_maps(
     title: str,
 ) -> bytes:
     """Return the figure of some pixels. Raises UsageError for one without ground truth."""
-    from splinecli.methods.batched import NetworkEstimator
-
-    assert isinstance(estimator, NetworkEstimator)
     for row, column in pixels:
         inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
         if not inside or np.isnan(errors_deg[row, column]):
@@ -269,15 +265,16 @@ def _observation_maps(
         chosen = [order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES]
         rows, columns = rows[chosen], columns[chosen]
     place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
-    sparse, dense, truth = estimator.maps(
+    maps = estimator.observation_maps(
         capture.observations[place], capture.light_directions, whole.observations[place], whole.light_directions
     )
+    assert maps is not None
     return observation_map_figure(
-        sparse,
-        dense,
-        truth if whole.n_lights > capture.n_lights else None,
+        maps.sparse,
+        maps.dense,
+        maps.every if whole.n_lights > capture.n_lights else None,
         pixels=np.stack([rows, columns], axis=1),
         error_deg=errors_deg[rows, columns],
         title=title,
-        grid=estimator.network.config.grid,
+        grid=maps.grid,
     )

@@ -33,7 +33,6 @@ from splinecli.evaluation.tables import AVERAGE
 from splinecli.evaluation.trials import CaptureReading, Notes, Score, SharedDraw, Trial, TrialStore, open_to_score
 from splinecli.lights.light_fit import check_distant
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import refiner_of
 
 
 @dataclass
@@ -138,7 +137,7 @@ def plan_capture(
     protocols = tuple(task.protocol for task in able)
     methods = {trial.method for draw in needed for trial in draw}
     whole = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
-    whole = whole or any(refiner_of(estimator) is not None for estimator in estimators if estimator.name in methods)
+    whole = whole or any(estimator.refiner is not None for estimator in estimators if estimator.name in methods)
     seen = sorted({light for draw in needed for light in draw[0].lights})
     return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
 

@@ -26,12 +26,9 @@ from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import refiner_of
 from splinecli.system.files import as_splinecli_error, parse_json, refusals_as_output_errors, write_text
 from splinecli.system.progress import Progress
 from splinecli.system.publishing import is_plain
-
-_LONGEST_LINE = 1 << 16  # characters
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class TrialStore:
             kept = []
             if is_plain(path) and not fresh:
                 with path.open(encoding="utf-8", errors="replace") as file:
-                    while line := file.readline(_LONGEST_LINE):  # a longer one in parts
+                    while line := file.readline(1 << 16):  # a longer one in parts
                         if (read := _read_line(line)) is not None:
                             kept.append(line.rstrip("\n") + "\n")
                             self._scores.update((read,))
@@ -167,7 +164,7 @@ class TrialSource:
 
         It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
         """
-        protocol, rows = trial.protocol, None if whole else self.rows
+        protocol, pixels = trial.protocol, None if whole else self.rows
         seen = self.stored.choose_lights(self.places(trial.lights))
         if protocol.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
@@ -176,16 +173,16 @@ class TrialSource:
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if protocol.as_stored else seen.estimate_intensities()
         needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
-        if rows is not None and not needs_all:
-            seen, rows = seen.choose_pixels(rows), None
+        if pixels is not None and not needs_all:
+            seen, pixels = seen.choose_pixels(pixels), None
         capture = seen.capture if protocol.as_stored else seen.restore(intensities)
         if protocol.light_error_deg is not None:
             known = self.stored.intensities_known
             capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
-        if rows is None:
+        if pixels is None:
             return capture
         # Near lamps need the surface, which only all pixels together have.
-        return find_surface(capture).choose_pixels(rows)
+        return find_surface(capture).choose_pixels(pixels)
 
     def places(self, lights: Sequence[int]) -> list[int]:
         """Return the places of lights among those that were read."""
@@ -207,7 +204,7 @@ class SharedDraw:
         `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
         SplinecliError if the method returns normals that are not unit vectors.
         """
-        source, whole = self._source, refiner_of(estimator) is not None
+        source, whole = self._source, estimator.refiner is not None
         with self._lock:
             if whole not in self._captures:
                 self._captures[whole] = source.see(trial, whole=whole)
@@ -275,14 +272,14 @@ class CaptureReading:
         except OSError as error:
             raise as_splinecli_error(error, self.folder) from error
         first = self.protocols[0]
-        rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
-        if len(rows) == stored.capture.n_pixels:
+        pixels = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
+        if len(pixels) == stored.capture.n_pixels:
             trials = TrialSource(stored)
         elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
             # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
-            trials = TrialSource(stored, rows)
+            trials = TrialSource(stored, pixels)
         else:
-            trials = TrialSource(stored.choose_pixels(rows))
+            trials = TrialSource(stored.choose_pixels(pixels))
         notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
         return trials, notes
 
@@ -306,7 +303,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
             f"{name}: the first {damaged} images are known to be damaged and are used;"
             f" --skip-first {name}={damaged} leaves them out."
         )
-    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN]
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.kind == GROUND_TRUTH_UPSIDE_DOWN]
     if capture.ground_truth is not None:
         sample = sample_observations(capture.observations, capture.mask)
         wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
@@ -328,8 +325,8 @@ def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")
-    rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
-    if max_pixels is not None and len(rows) > max_pixels:
-        generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])
-        rows = np.sort(generator.permutation(rows)[:max_pixels])
-    return rows
+    pixels = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
+    if max_pixels is not None and len(pixels) > max_pixels:
+        generator = np.random.default_rng([PIXELS_STREAM, seed, len(pixels)])
+        pixels = np.sort(generator.permutation(pixels)[:max_pixels])
+    return pixels

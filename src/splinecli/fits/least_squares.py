@@ -88,7 +88,6 @@ def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:
 
 
 LAMBERTIAN_SHADOW_SHARE = 0.05
-LAMBERTIAN_FITS = 5
 _PRIOR = 1e-4
 
 
@@ -111,7 +110,7 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
     prior = observed.new_tensor((_PRIOR,) * 3 + (0.0,) * 3)[:, None]
     solution = observed.new_tensor((0.0, 0.0, 1e-3))[:, None].expand(3, len(observations))
     weight = lit
-    for iteration in range(LAMBERTIAN_FITS):
+    for iteration in range(5):
         if iteration:
             weight = lit / ((_dot(light_directions, solution) - observed).abs() + 0.02)
         inverse = inverse_3x3((_sum(products, weight) + prior).unbind(), SMALLEST_PIVOT)
@@ -186,9 +185,6 @@ def alternating_signs(light_directions: Tensor) -> Tensor:
     return 1 - 2 * (place % 2).to(light_directions)
 
 
-TRIMMED_SHARE = 0.2
-"""Share of the observations that is left out at each end: with ten lights, the two darkest and the two brightest."""
-
 SHADOW_SHARE = 0.1
 """Share of the pixel's quantile UNSHADED. Trimmed LS and IW12 leave darker observations out as shadows, as the authors
 of IW12 do."""
@@ -202,17 +198,15 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
     Equal observations are kept or left out together, so the order of the lights does not matter.
     """
     count = observations.shape[1]
-    trimmed = max(0, min(int(TRIMMED_SHARE * count), (count - FEWEST) // 2))
+    # Share of the observations that is left out at each end: with ten lights, the two darkest and the two
+    # brightest.
+    trimmed = max(0, min(int(0.2 * count), (count - FEWEST) // 2))
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
     middling = (observations >= darkest) & (observations <= brightest)
     weight = lit_observations(observations, SHADOW_SHARE, middling)
     scaled_normals, _ = weighted_least_squares(observations, light_directions, weight.to(observations.dtype))
     return scaled_normals
-
-
-L1_FITS = 50
-SMALLEST_RESIDUAL = 1e-7  # weights stop growing below this residual, for a largest observation of 1
 
 
 def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
@@ -222,9 +216,10 @@ def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     three smallest residuals is used where it is better.
     """
     weight = torch.ones_like(observations)
-    for step in range(L1_FITS):
+    for step in range(50):
         scaled_normals, residual = _fit(observations, light_directions, weight)
-        weight = 1 / residual.clamp(min=max(SMALLEST_RESIDUAL, 0.1 * 0.5**step))
+        # Weights stop growing below a residual of 1e-7, for a largest observation of 1.
+        weight = 1 / residual.clamp(min=max(1e-7, 0.1 * 0.5**step))
     three = torch.zeros_like(weight).scatter_(1, weight.topk(3, dim=1).indices, 1.0)
     vertex, residual_there = _fit(observations, light_directions, three)
     better = residual_there.sum(dim=1, keepdim=True) < residual.sum(dim=1, keepdim=True)

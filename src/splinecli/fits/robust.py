@@ -4,8 +4,6 @@
 positive definite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -24,8 +24,6 @@ from torch.nn.functional import normalize
 
 from splinecli.fits.least_squares import lit_observations, weighted_least_squares
 
-VIEW = (0.0, 0.0, 1.0)
-
 FEWEST_LIT = 4  # number of brightest observations that never count as shadows: three for the normal, one for the noise
 RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
@@ -35,18 +33,10 @@ PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
 Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come first; within a degree, those with larger a.
 """
 
-FIRST_NOISE = 1e-3  # initial standard deviation of the noise, relative to the brightest kept observation
-
-TURNED_AWAY = 10.0
-"""Cost, for each unit of cosine, of a normal that faces away from the view or from a light that reaches it."""
-
 
 SHADOW_SHARE = 0.4  # observations below this share of the pixel's quantile UNSHADED are shadows
 KEPT_SHARE, FEWEST_KEPT = 0.25, 8  # How many of the others are kept; see kept_count. The first is T_low in the paper.
 
-SPREAD = 0.1
-"""Standard deviation of the prior on the two linear coefficients, relative to the brightest kept observation. It halves
-with each further degree."""
 
 _ROUNDS, _STEPS = 5, 4  # estimates of the noise, and Levenberg-Marquardt steps for each
 
@@ -59,7 +49,8 @@ def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
     # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse normals.
     all_alike = torch.ones_like(observations, dtype=torch.float64)
     normals = normalize(weighted_least_squares(observations.double(), lights, all_alike)[0], dim=1)
-    noise = torch.full_like(normals[:, 0], FIRST_NOISE**2)
+    # The initial standard deviation, relative to the brightest kept observation
+    noise = torch.full_like(normals[:, 0], 1e-3**2)
     damping = torch.full_like(noise, 1e-2)
     for _ in range(_ROUNDS):
         fit = _fit(problem, normals, noise)
@@ -120,7 +111,7 @@ class _Fit(NamedTuple):
 
 def _select(observations: Tensor, lights: Tensor) -> _Problem:
     count = observations.shape[1]
-    view = lights.new_tensor(VIEW)
+    view = lights.new_tensor((0.0, 0.0, 1.0))
     ordered, index = observations.sort(dim=1)
     is_lit = lit_observations(observations, SHADOW_SHARE, fewest=FEWEST_LIT) & (observations > 0)
     lit = is_lit.sum(dim=1)
@@ -147,7 +138,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
         lights=kept_lights * is_kept[..., None],
         bisectors=bisectors,
         light_powers=_powers((kept_lights * bisectors).sum(dim=-1)),
-        precision=torch.where(degree > 0, (SPREAD * 0.5 ** (degree - 1)) ** -2, 0),
+        # The prior's standard deviation, relative to the brightest kept observation, halves with each degree.
+        precision=torch.where(degree > 0, (0.1 * 0.5 ** (degree - 1)) ** -2, 0),
         ridge=torch.where(left_out, 1e9, 1e-12),
         facing=torch.cat((lights * is_lit[..., None], view.expand(len(observations), 1, 3)), dim=1),
     )
@@ -182,7 +174,8 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     away = (-problem.facing @ normals[..., None]).clamp(min=0).sum(dim=(1, 2))
     return _Fit(
         normals=normals,
-        cost=squares + (prior * coefficients[..., 0].square()).sum(dim=1) + TURNED_AWAY * away,
+        # Normals that face away from the view, or from a light that reaches them, cost 10 a unit of cosine.
+        cost=squares + (prior * coefficients[..., 0].square()).sum(dim=1) + 10.0 * away,
         noise=squares / freedom.clamp(min=0.5),
         tangents=tangents,
         gradient=(jacobian.mT @ residual)[..., 0],

@@ -13,50 +13,25 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.lights.lamp_light import LampLight, LightOf, Rows, parts_of_rows
+from splinecli.maths import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-
-NEGLIGIBLE = 0.02
-"""Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most."""
-
 _BLOCKS = 1200  # parts of the surface that exchange light
 
-_SHADOW_PIXELS = 50_000
-_SHADOW_COSINE = -0.05
-"""Attached shadows are looked for at about so many pixels, and so many are needed. There, the cosine of the angle
-between light and normal is below the last number."""
 
-_LEAST_CORRELATION = 0.6
-"""Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes, metal."""
-
-_BRIGHT_QUANTILE, _MOST_ALBEDO = 0.98, 1.4
-"""This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak where the
-camera does not see what reflects."""
-
-_MOST_RADIANCE = 3.0
-"""A block sends at most this many times the light of a matte one that faces the lamp. The rest is a highlight, which
-goes another way."""
-
-_NEAREST = 0.5  # added to the distances, in sides of a block, because neighbours are not only their middles
-_ALIKE = 0.998  # cosine of gathered and ambient light, above which the two cannot be separated
 _DARK_SHARE = 0.02  # of the bright pixels' albedo; darker ones are background
-_LARGEST_ALBEDO = 10.0  # pixels that all lamps graze may have any
 _LEAST_Z = 0.15  # of a block's normal, for its area
-_LEAST_LEFT = 0.02  # of an observation; what is gathered is never exact
 
 
 class PixelPlaces:
     """Rows and columns of the pixels of a mask. Two bytes a pixel, as captures may have many."""
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
+    def __init__(self, mask: Bools) -> None:
         kind = np.min_scalar_type(mask.shape[1])
         self._columns = np.concatenate([np.flatnonzero(row).astype(kind) for row in mask])
         self._ends = np.count_nonzero(mask, axis=1).cumsum()
@@ -71,26 +46,29 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Floats  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
-    albedo: NDArray[np.floating]  # (P,), the share of the arriving light that a pixel reflects
+    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
+    albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
-    def at(self, rows: Rows) -> Floats:
+    def at(self, pixels: Rows) -> Singles:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
-        arriving = self.blocks.sample(self.arriving, *self.pixels.places(rows))
-        return np.asarray(arriving * self.albedo[rows, None], np.float32)
+        arriving = self.blocks.sample(self.arriving, *self.pixels.places(pixels))
+        return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
-    def remove(self, observations: Floats, rows: Rows) -> Floats:
+    def remove(self, observations: Singles, pixels: Rows) -> Singles:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
-        return np.asarray(np.maximum(observations - self.at(rows), _LEAST_LEFT * observations), np.float32)
+        # Something is left of each observation, because what is gathered is never exact.
+        return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
-    def counts_at(self, observations: Floats, rows: Rows) -> NDArray[np.bool_]:
+    def counts_at(self, observations: Singles, pixels: Rows) -> Bools:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
-        return np.asarray(self.at(rows).max(axis=1) > NEGLIGIBLE * observations.max(axis=1))
+        # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at
+        # most.
+        return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
 def find_indirect_light(
-    mask: NDArray[np.bool_], observations: Floats, light_of: LightOf, normals: Floats
+    mask: Bools, observations: Singles, light_of: LightOf, normals: Singles
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
 
@@ -118,7 +96,9 @@ def find_indirect_light(
 
     def sum_up(rows: Rows) -> Doubles:
         rows = rows[lit[rows]]
-        most = _MOST_RADIANCE * albedo[rows, None]
+        # A block sends at most this many times the light of a matte one that faces the lamp. The rest is a
+        # highlight, which goes another way.
+        most = 3.0 * albedo[rows, None]
         sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
         values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
@@ -132,11 +112,14 @@ def find_indirect_light(
     exposure = _exposure(indirect, observations, light_of, normals)
     if exposure is None:
         return None
-    exposure = min(exposure, _MOST_ALBEDO / float(np.quantile(albedo[lit], _BRIGHT_QUANTILE)))
-    return replace(indirect, albedo=(exposure * albedo).clip(max=_LARGEST_ALBEDO).astype(np.float16))
+    # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak
+    # where the camera does not see what reflects.
+    exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
+    # Pixels that all lamps graze may have any albedo.
+    return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
-def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Floats:
+def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Singles:
     """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
 
     Nothing between two blocks hides them from each other. `covered` (p,) is the share of each block that the mask
@@ -148,7 +131,8 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
-    square = np.square(towards).sum(axis=-1) + _NEAREST**2
+    # Half a side of a block is added, because neighbours are not only their middles.
+    square = np.square(towards).sum(axis=-1) + 0.5**2
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
     entering = np.einsum("ijk,ik->ij", towards, facing).clip(min=0)
@@ -159,42 +143,46 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     return np.asarray(factors @ sent.astype(np.float32))
 
 
-def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, normals: Floats) -> float | None:
+def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf, normals: Singles) -> float | None:
     """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
     under a ring of lights, indirect light does so, too. It then counts as indirect.
     """
     found = []
-    step = max(1, len(normals) // _SHADOW_PIXELS)
-    for rows in parts_of_rows(len(normals), step=step):
-        light = light_of(rows)
-        gathered = indirect.at(rows)
-        shadow = (_cosines(light, normals[rows]) < _SHADOW_COSINE) & (gathered > 0)
-        albedo = np.broadcast_to(indirect.albedo[rows, None], shadow.shape)
-        found.append(np.stack((observations[rows][shadow], gathered[shadow], albedo[shadow])))
+    step = max(1, len(normals) // 50_000)
+    for pixels in parts_of_rows(len(normals), step=step):
+        light = light_of(pixels)
+        gathered = indirect.at(pixels)
+        # In attached shadows, the cosine of the angle between light and normal is negative.
+        shadow = (_cosines(light, normals[pixels]) < -0.05) & (gathered > 0)
+        albedo = np.broadcast_to(indirect.albedo[pixels, None], shadow.shape)
+        found.append(np.stack((observations[pixels][shadow], gathered[shadow], albedo[shadow])))
     seen, gathered, albedo = np.hstack(found).astype(np.float64)
     if len(seen) < 50:
         return None
     with np.errstate(invalid="ignore"):  # black shadows have no correlation
         correlation = np.corrcoef(seen, gathered)[0, 1]
-    if not correlation >= _LEAST_CORRELATION:
+    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes,
+    # metal.
+    if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
-    if gathered @ albedo < _ALIKE * np.linalg.norm(gathered) * np.linalg.norm(albedo):
+    # More alike, gathered and ambient light cannot be separated.
+    if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
         with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
 
 
-def _albedo(light: LampLight, normals: Floats) -> Floats:
+def _albedo(light: LampLight, normals: Singles) -> Singles:
     """Return the albedos (n,) of matte pixels, in the unit of the observations."""
     cosines = _cosines(light, normals).clip(min=0)
     shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
     return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
 
 
-def _cosines(light: LampLight, normals: Floats) -> Floats:
+def _cosines(light: LampLight, normals: Singles) -> Singles:
     """Return the cosines (n, F) of the angles between normals (n, 3) and lights."""
     own, directions = light.in_frame_of_pixels(normals), light.directions.astype(np.float32)
     if directions.ndim == 2:

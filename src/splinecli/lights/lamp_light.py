@@ -6,16 +6,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture.near_lamps import NearLamps
+from splinecli.maths import Floats, Integers, Singles
 from splinecli.maths.normals import unit
 from splinecli.surface.pixel_grid import focal_length, ray_basis, rays_at
 
-Floats = NDArray[np.floating]
 
-
-def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Floats) -> NDArray[np.float32]:
+def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Floats) -> Singles:
     """Return the points (N, 3) of a surface, in the unit of the lamps' positions.
 
     Args:
@@ -41,25 +39,25 @@ def flat_depth(lamps: NearLamps) -> float:
 class LampLight:
     """Observations as distant lamps would give them, with the light directions of each pixel."""
 
-    observations: NDArray[np.float32]  # (P, F), without the falloff of the lamps
+    observations: Singles  # (P, F), without the falloff of the lamps
     # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights and an
     # orthographic camera
-    directions: NDArray[np.floating]
-    turns: NDArray[np.float32] | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
+    directions: Floats
+    turns: Singles | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
 
     @classmethod
-    def of(cls, observations: NDArray[np.float32], lamps: NearLamps) -> LampLight:
+    def of(cls, observations: Singles, lamps: NearLamps) -> LampLight:
         """Return the light on the points of `lamps`, from observations (P, F)."""
         assert lamps.points is not None
-        directions, strengths = lamps.light_at(lamps.points)
+        directions, attenuation = lamps.light_at(lamps.points)
         turns = None
         if lamps.camera_matrix is not None:
             turns = _turns_to_view(unit(_camera_position(lamps) - lamps.points)).astype(np.float32)
             directions = np.einsum("pij,pfj->pfi", turns, directions)
-        return cls(observations / strengths, directions, turns)
+        return cls(observations / attenuation, directions, turns)
 
     @classmethod
-    def distant(cls, observations: NDArray[np.float32], directions: Floats, rays: Floats) -> LampLight:
+    def distant(cls, observations: Singles, directions: Floats, rays: Floats) -> LampLight:
         """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3) from the camera."""
         turns = _turns_to_view(unit(-rays)).astype(np.float32)
         return cls(observations, np.einsum("pij,fj->pfi", turns, directions.astype(np.float32)), turns)
@@ -73,7 +71,7 @@ class LampLight:
         return vectors if self.turns is None else np.einsum("pji,p...j->p...i", self.turns, vectors)
 
 
-Rows = NDArray[np.integer]  # numbers of some of a capture's pixels, in the order of its mask
+Rows = Integers  # numbers of some of a capture's pixels, in the order of its mask
 LightOf = Callable[[Rows], LampLight]  # from rows of a capture's pixels to their observations and light directions
 LIT_AT_ONCE = 1 << 14  # pixels whose light is asked for at once: under near lamps, each has its own lights
 

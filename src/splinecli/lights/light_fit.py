@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.record import Capture
-from splinecli.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
+from splinecli.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECTED, CaptureWarning
 from splinecli.errors import UsageError
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
 from splinecli.maths import Doubles, Floats, Singles
@@ -29,17 +29,12 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
 
-DARK_SHARES = (0.1, 0.02)
-"""Pixels below this share of the brightest hundredth are left out: background. The second counts where too few are left
-by the first, because highlights outshine the object."""
 
 MIN_PIXELS_PER_LIGHT = 10
 
 MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
-RANDOM_ORDERS = 250  # number of random orders of the lights that a given order is compared with
 INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
 
-INTENSITY_LIMITS = (0.1, 10.0)
 
 _ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
 _PRIOR = 1e-9
@@ -95,7 +90,7 @@ class Factors:
             matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
             along = np.einsum("cf,nfc->nf", self.matrix, matrices)
             intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
-            intensities = intensities.clip(*INTENSITY_LIMITS)
+            intensities = intensities.clip(*(0.1, 10.0))
         return intensities, matrices
 
 
@@ -129,7 +124,8 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
 
 def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
     """Return the misfits of the lights (F, 3) in random orders, in rising order."""
-    given = np.tile(np.arange(len(light_directions)), (RANDOM_ORDERS, 1))
+    # A given order is compared with so many random ones.
+    given = np.tile(np.arange(len(light_directions)), (250, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)
     if factors.intensities_known:
         # One basis serves all orders, which saves most of the time.
@@ -167,7 +163,9 @@ def fit_residual(values: Doubles, light_directions: Doubles) -> float:
 def sample_pixels(observations: Floats) -> Doubles:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
-    for share in DARK_SHARES:
+    # Pixels below this share of the brightest hundredth are left out: background. The second counts where too few
+    # are left by the first, because highlights outshine the object.
+    for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
         kept: Doubles = values[(values > LIT_SHARE).sum(axis=1) >= 4]
@@ -182,22 +180,15 @@ LARGEST_LIGHT_ERROR_DEG = 30.0
 
 MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
 
-BETTER_FIT = 0.7
-"""Refined lights are taken if the median residual falls below this share of that under the given lights. On rendered
-captures with exact lights, it seldom does; docs/measurements.md has the figures."""
 
 MAX_MISFIT = 0.018
 """Largest median residual, as a share of a pixel's brightest observation, with which refined lights are taken. Metals
 have more, and a matte model would move their lights wrongly."""
 
-ROUGH_MISFIT = 0.04
-"""Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to be
-suggested. Few matte or shiny captures with exact lights have more."""
 
 INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
 
 _MIN_PIXELS = 100
-_SHADOW_SHARE = 0.1  # of the pixel's quantile below, as in IW12
 _WORTH_PIXELS = 50.0  # see fit_near
 
 _FIRST_FITS, _FITS_PER_ROUND = 8, 2
@@ -236,7 +227,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        kept = CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {_why_kept(capture)}.")
+        kept = CaptureWarning(REFINEMENT_REJECTED, f"The light directions were not refined: {_why_kept(capture)}.")
         return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:
@@ -260,7 +251,9 @@ def would_refine(observations: Floats, factors: Factors | None, light_directions
 
     It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
-    if factors is None or factors.misfits(light_directions[None])[0] < ROUGH_MISFIT:
+    # Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to
+    # be suggested. Few matte or shiny captures with exact lights have more.
+    if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
     # Intensities that nobody measured are not the fault of the directions.
     intensities = factors.intensities(light_directions[None])[0]
@@ -313,7 +306,9 @@ def refine_lights(
     )
     if fit is None:
         return None
-    better = fit.after < MAX_MISFIT and fit.fit_ratio < BETTER_FIT and bool((fit.directions[:, 2] > 0).all())
+    # Refined lights are taken if the median residual falls below this share of that under the given lights. On
+    # rendered captures with exact lights, it seldom does; docs/measurements.md has the figures.
+    better = fit.after < MAX_MISFIT and fit.fit_ratio < 0.7 and bool((fit.directions[:, 2] > 0).all())
     return fit if better else None
 
 
@@ -338,7 +333,7 @@ def fit_near(
     values = _choose_pixels(observations)
     if values is None:
         return None
-    reference = _SHADOW_SHARE * np.quantile(values, 0.6, axis=1, keepdims=True)
+    reference = 0.1 * np.quantile(values, 0.6, axis=1, keepdims=True)  # as in IW12
     lit = (values > reference).astype(np.float64)
     lights = light_directions
     normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)

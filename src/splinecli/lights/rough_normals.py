@@ -164,19 +164,11 @@ def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
     return np.asarray(right), np.asarray(-downwards)
 
 
-AGREEMENT_WEIGHT = 5.0
-"""Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9 with right
-lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01."""
-
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
 """From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
 reading has at most the second part of it."""
 
-OPEN_MISSING, OPEN_MISSING_OF_OTHER = 0.01, 0.75
-"""The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images were
-rendered without cast shadows, which is not evidence against the lights."""
 
-_FEWEST_SHARE, _FEWEST = 0.001, 20  # of lit observations in shadow, below which they are noise and highlights
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
 _LIT_SHARE, _DARK_SHARE = 0.25, 0.4  # of a pixel's brightest shading, and of its own, beyond which shadows are judged
 _MARGIN = 0.5  # pixels that a surface must rise above a ray
@@ -191,7 +183,9 @@ class Shadows:
 
     def evidence(self, other: Shadows) -> float:
         """Return the evidence for another reading against this one, as an advantage of light_check.py."""
-        found = AGREEMENT_WEIGHT * (other.agreement - self.agreement)
+        # Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9
+        # with right lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01.
+        found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
             return found + 1
         if other.missing > MISSING and self.missing < MISSING_OF_OTHER * other.missing:
@@ -200,7 +194,9 @@ class Shadows:
 
     def leaves_open(self, other: Shadows) -> bool:
         """Return whether shadows that this reading needs are missing, more than those of another one."""
-        return self.missing > OPEN_MISSING and other.missing < OPEN_MISSING_OF_OTHER * self.missing
+        # The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images
+        # were rendered without cast shadows, which is not evidence against the lights.
+        return self.missing > 0.01 and other.missing < 0.75 * self.missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +235,8 @@ class ShadowCheck:
         dark = self.dark[self.lit]
         common = np.count_nonzero(cast & dark)
         agreement = 0.0
-        if common >= max(_FEWEST, _FEWEST_SHARE * len(dark)) and not cast.all() and not dark.all():
+        # Fewer lit observations in shadow are noise and highlights.
+        if common >= max(20, 0.001 * len(dark)) and not cast.all() and not dark.all():
             agreement = float(np.corrcoef(cast, dark)[0, 1])
         return Shadows(agreement, float((cast & ~dark).mean()))
 

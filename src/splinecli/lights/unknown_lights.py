@@ -42,15 +42,11 @@ _SHADOW_LOG_ODDS, _OUTLINE_LOG_ODDS = 11.0, 8.0
 _BLOCKS = 1200  # at most twice as many
 _FITS = 5
 _LEAST_Z = 0.1  # of normals that are integrated
-_FACING = 0.15  # predicted share of a pixel's brightest observation, above which darkness is a cast shadow
 _SHADOW = 0.5  # of the predicted brightness
 _DARK_SHARE = 0.02  # of the brightest hundredth
 
-_LOW_DEG = 55.0  # mean elevation of lights, below which the network finds them too high
 _LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)  # logarithms of the factors of the heights of the lights that are tried
-_HEIGHT_PRIOR = 49.0  # entropy per square of this logarithm and of the expected error in degrees
 _ALBEDO_BIN, _ALBEDO_BINS = 0.1, 41  # of the logarithm of the albedo
-_MOST_FITTED, _SHADE = 2000, 0.1
 
 
 def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles) -> float:
@@ -76,7 +72,8 @@ def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles)
     normals[..., 2] = np.where(mask, normals[..., 2].clip(min=_LEAST_Z), 0)
     heights = np.where(mask, integrate_normals(unit(normals), mask), np.nan)
     predicted = scaled @ light_directions.T
-    facing = bright & (predicted > _FACING)
+    # Where so much is predicted of a pixel's brightest observation, darkness is a cast shadow.
+    facing = bright & (predicted > 0.15)
     dark = values[facing] < _SHADOW * predicted[facing]
     bump, hollow = (
         _correlation(cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark)
@@ -103,16 +100,17 @@ def lower_lights(observations: Singles, light_directions: Doubles, error_deg: fl
         light_directions: (F, 3), unit.
         error_deg: the mean expected error.
     """
-    if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > _LOW_DEG:
+    # The network finds lower lights too high.
+    if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
         return light_directions
-    chosen, values = lit_values(observations, _DARK_SHARE, _MOST_FITTED)
-    lit = values > _SHADE * np.quantile(values, 0.6, axis=1, keepdims=True)
+    chosen, values = lit_values(observations, _DARK_SHARE, 2000)
+    lit = values > 0.1 * np.quantile(values, 0.6, axis=1, keepdims=True)
     scaled, _ = fit_robustly(values, lit.astype(np.float64), light_directions, _FITS)
     known = (lit.sum(axis=1) > 3) & (unit(scaled)[:, 2] > _LEAST_Z)
     scaled = (scaled * observations[chosen].max(axis=1)[:, None])[known]
     if len(scaled) < _ALBEDO_BINS:
         return light_directions
-    prior = _HEIGHT_PRIOR / error_deg**2
+    prior = 49.0 / error_deg**2  # entropy per square of this logarithm and of the expected error in degrees
     costs = [_entropy(scaled / (1, 1, np.exp(log))) + prior * log**2 for log in _LOG_HEIGHTS]
     return np.asarray(unit(light_directions * (1, 1, np.exp(_LOG_HEIGHTS[int(np.argmin(costs))]))))
 
@@ -128,12 +126,6 @@ def _entropy(scaled_normals: Doubles) -> float:
 
 Array = NDArray[np.float64]
 
-MIN_PIXELS = 20  # fewer lit pixels at the outline show no rotation
-
-_SMOOTHING = 0.02
-"""Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
-
-_BORDER = 0.01  # masks of objects that fill the image may leave out a border of this share of its sides
 
 _RIM_Z = 0.25
 """Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
@@ -175,7 +167,7 @@ def turn_at_outline(
     from scipy.spatial.transform import Rotation
 
     normals, outwards = _rim(observations, mask, light_directions)
-    if len(normals) < MIN_PIXELS:
+    if len(normals) < 20:  # fewer lit pixels at the outline show no rotation
         return None
     along = np.cross((0.0, 0.0, 1.0), outwards)
     turn = Rotation.identity()
@@ -196,7 +188,8 @@ def turn_at_outline(
 def outline_share(mask: NDArray[np.bool_]) -> float:
     """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of the image."""
     boundary = _boundary(mask)
-    rows, columns = (1 + round(_BORDER * side) for side in mask.shape)
+    # Masks of objects that fill the image may leave out a border of this share of its sides
+    rows, columns = (1 + round(0.01 * side) for side in mask.shape)
     inside = boundary[rows:-rows, columns:-columns]
     return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
 
@@ -213,7 +206,9 @@ def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_direc
     """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
-    width = max(1.5, _SMOOTHING * float(np.sqrt(np.count_nonzero(mask))))
+    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls
+    # outwards.
+    width = max(1.5, 0.02 * float(np.sqrt(np.count_nonzero(mask))))
     outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
     values = observations[rim[mask]].astype(np.float64)
     brightest = values.max(axis=1, keepdims=True, initial=0)
@@ -230,29 +225,14 @@ def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_direc
 LARGEST_ERROR_DEG = 20.0
 """Lights with a larger expected error on average are refused: their normals would be worth little."""
 
-LARGEST_MISFIT = 0.08
-"""Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes, metals
-among them, have at most half of it."""
-
-LEAST_OUTLINE = 0.5
-"""Smallest share of the mask's boundary inside the image. With less, the object continues outside of it."""
-
-LEAST_SIDE = 0.15
-"""Smallest share of a direction towards a side from which a light comes: 9 degrees from the camera axis."""
-
-SAME_IMAGES = 0.01  # images that differ by less from their mean, as a share of it, show no light that moves
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near
-_CLEAR_OUTLINE = 0.2  # largest spread of an outline that counts
-_OUTLINE_SHARE = 0.35  # of the turn that it shows
-_LARGEST_TURN = 2.0  # times the expected error; what a larger turn has beyond it comes from the mouth of a vessel
 # Log odds that the network takes a bump for a bump: fewer where it expects larger errors.
 _MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
 # The mean error of what is returned from that which the network expects, on 720 rendered captures with and without an
 # outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
 _ERROR_SCALE, _ERROR_POWER, _LEAST_ERROR_DEG = 0.39, 1.3, 1.2
-_ERROR_SHARE = 0.65  # without an outline
 _MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 
@@ -285,11 +265,13 @@ def find_lights(
         grid[::step, ::step] = mask[::step, ::step]
         observations, mask = observations[grid[mask]], mask[::step, ::step]
     _check_different(observations)
-    outlined = outline_share(mask) >= LEAST_OUTLINE
+    # Smallest share of the mask's boundary inside the image. With less, the object continues outside of it.
+    outlined = outline_share(mask) >= 0.5
     if refuse and first_light is None and not outlined:
+        remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
         raise InputError(
             "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
-            hint="If the images show the whole object, give its mask, or add --auto-mask. Else say where the light of"
+            hint=f"If the images show the whole object, {remedy}. Else say where the light of"
             " the first image that is used comes from: --first-light left, upper-left, or its azimuth in degrees,"
             " counter-clockwise from the right",
         )
@@ -300,7 +282,9 @@ def find_lights(
         observations = np.asarray(observations / intensities, np.float32)
     error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=_WORTH_PIXELS)
-    if refuse and fit is not None and fit.after > LARGEST_MISFIT:
+    # Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes,
+    # metals among them, have at most half of it.
+    if refuse and fit is not None and fit.after > 0.08:
         problem = "the images do not show one surface under different distant lights, so the lights cannot be found"
         hint = "Check that camera and object stood still, and that all images show the same object"
         raise InputError(problem, hint=hint)
@@ -314,12 +298,13 @@ def find_lights(
         directions = directions * (-1, -1, 1) if log_odds < 0 else directions
         opposite_share = 1 / (1 + math.exp(abs(log_odds)))
     turn = turn_at_outline(observations, mask, directions)
-    if turn is not None and turn.spread < _CLEAR_OUTLINE:
-        share = _OUTLINE_SHARE * min(1, _LARGEST_TURN * expected_deg / max(turn.angle_deg, 1e-9))
+    if turn is not None and turn.spread < 0.2:  # outlines of larger spread do not count
+        # What a larger turn has beyond twice the expected error comes from the mouth of a vessel.
+        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the turn that it shows
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
-    found_deg = _ERROR_SCALE * expected_deg**_ERROR_POWER if outlined else _ERROR_SHARE * expected_deg
+    found_deg = _ERROR_SCALE * expected_deg**_ERROR_POWER if outlined else 0.65 * expected_deg  # without an outline
     errors_deg = errors_deg * math.hypot(found_deg, _LEAST_ERROR_DEG) / expected_deg
     opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
@@ -340,7 +325,8 @@ def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.fl
     """
     azimuth = math.radians(azimuth_of(first_light))
     towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
-    if abs(towards) < LEAST_SIDE:
+    # Smallest share of a direction towards a side from which a light comes: 9 degrees from the camera axis.
+    if abs(towards) < 0.15:
         problem = f"the first light does not come clearly from {first_light}, nor from the opposite side"
         hint = "Give its azimuth in degrees, as --first-light 45, or put an image with a light from a side first"
         raise InputError(problem, hint=hint)
@@ -352,7 +338,8 @@ def _check_different(observations: NDArray[np.float32]) -> None:
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
     mean = rows.mean(axis=1, keepdims=True)
-    if np.abs(rows - mean).mean() <= SAME_IMAGES * mean.mean():  # equal for black images
+    # Images that differ by less from their mean show no light that moves.
+    if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
         problem = "all images are alike, so they say nothing about the lights"
         raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
 

@@ -48,11 +48,7 @@ def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
 
 
 def encode_picture(
-    normals: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    *,
-    bits: int = 16,
-    convention: Convention = "opengl",
+    normals: NDArray[np.floating], mask: NDArray[np.bool_], *, bits: int = 16, convention: Convention = "opengl"
 ) -> NDArray[np.unsignedinteger]:
     """Encode a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
 
@@ -130,13 +126,6 @@ def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
     )
 
 
-SMALLEST_Z = 0.05
-"""Normals beyond 87 degrees from the camera axis have no usable slope."""
-
-CURVATURE_SIGMA = 2.0
-"""Standard deviation in pixels of the Gaussian filter of the normals before they are derived."""
-
-
 def gradient_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the surface is too steep.
 
@@ -144,12 +133,13 @@ def gradient_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W).
     """
-    z = np.where(mask & (normal_map[..., 2] >= SMALLEST_Z), normal_map[..., 2], np.nan)
+    # Normals beyond 87 degrees from the camera axis have no usable slope.
+    z = np.where(mask & (normal_map[..., 2] >= 0.05), normal_map[..., 2], np.nan)
     return np.asarray(-normal_map[..., :2] / z[..., None], np.float32)
 
 
 def curvature_of_normals(
-    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float = CURVATURE_SIGMA
+    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float = 2.0
 ) -> NDArray[np.float32]:
     """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
 

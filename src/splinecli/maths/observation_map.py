@@ -70,12 +70,7 @@ def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
 
 
 def sparse_map(
-    values: Tensor,
-    light_directions: Tensor,
-    valid: Tensor | None = None,
-    *,
-    size: int = MAP_SIZE,
-    grid: Grid = "even",
+    values: Tensor, light_directions: Tensor, valid: Tensor | None = None, *, size: int = MAP_SIZE, grid: Grid = "even"
 ) -> SparseMap:
     """Return the sparse maps of values (P, F) or (P, F, C). Values of lights in the same cell are averaged.
 

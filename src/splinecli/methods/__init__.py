@@ -1,4 +1,4 @@
-"""The methods by name. To add a method, write one file and add one entry here.
+"""The methods by name: a method is one file, and one row of METHODS.
 
 The file is imported when the method is used.
 """
@@ -6,13 +6,22 @@ The file is imported when the method is used.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
+from pkgutil import resolve_name
 
-from splinecli.errors import check_one_of
-from splinecli.methods.estimator import Estimator
+from splinecli.errors import ModelError, check_one_of
+from splinecli.methods.estimator import Estimator, LeastSquares
 from splinecli.system.machine import Device, Precision
 
-__all__ = ["DEFAULT_METHOD", "Estimator", "MethodOptions", "check_method", "make_estimator", "method_names"]
+__all__ = [
+    "DEFAULT_METHOD",
+    "METHODS",
+    "Estimator",
+    "Method",
+    "MethodOptions",
+    "check_method",
+    "make_estimator",
+    "method_names",
+]
 
 DEFAULT_METHOD = "spline-net"
 
@@ -35,10 +44,25 @@ class MethodOptions:
     precision: Precision = "auto"
 
 
+@dataclass(frozen=True)
+class Method:
+    """A row of METHODS.
+
+    make: returns the estimator from the method's name and its options, and imports what is heavy.
+    principle, source: for the documentation; without a source, the method is splinecli's own.
+    observation_maps: whether figures of evaluations can show its observation maps.
+    """
+
+    make: Callable[[str, MethodOptions], Estimator]
+    principle: str
+    source: str = "-"
+    observation_maps: bool = False
+
+
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
     """Return the estimator of this name.
 
-    Methods that run in PyTorch (all but "ls") limit its threads to the cores that the process may use; see
+    Methods that run in PyTorch limit its threads to the cores that the process may use; see
     splinecli.system.machine.use_available_cores.
 
     Raises:
@@ -46,64 +70,102 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
         ModelError: the weights cannot be used.
     """
     check_method(name)
-    return _METHODS[name](name, options)
+    return METHODS[name].make(name, options)
 
 
 def check_method(name: str) -> None:
     """Raise UsageError if no method has this name. Loads nothing heavy."""
-    check_one_of("method", name, _METHODS)
+    check_one_of("method", name, METHODS)
 
 
 def method_names() -> list[str]:
     """Return the names of all methods."""
-    return list(_METHODS)
+    return list(METHODS)
 
 
-def _least_squares(*_: object) -> Estimator:
-    from splinecli.methods.estimator import LeastSquares
-
-    return LeastSquares()
-
-
-def _solver(name: str, options: MethodOptions, *, fit: str, batch_size: int) -> Estimator:
+def _fit(name: str, options: MethodOptions, *, solve: str, batch_size: int = 8192) -> Estimator:
     from splinecli.methods.batched import BatchedEstimator
     from splinecli.system.machine import choose_device, use_available_cores
 
     use_available_cores()
-    module, function = fit.split(".")
-    solve = getattr(import_module(f"splinecli.fits.{module}"), function)
     size = batch_size if options.batch_size is None else options.batch_size
-    return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
+    device = str(choose_device(options.device))
+    return BatchedEstimator(name, resolve_name(f"splinecli.fits.{solve}"), device, size)
 
 
-def _network(name: str, options: MethodOptions, *, weights: str, rotations: int, refines: bool = True) -> Estimator:
+def _network(
+    name: str,
+    options: MethodOptions,
+    *,
+    weights: str,
+    rotations: int = 1,
+    interpolates: bool = True,
+    refines: bool = True,
+) -> Estimator:
+    """Return a network's estimator; one that interpolates has a LI-Net. Raises ModelError for other weights."""
     from splinecli.methods.batched import NetworkEstimator
     from splinecli.networks.weights import resolve_weights
     from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 
     use_available_cores()
     device = choose_device(options.device)
+    loaded = resolve_weights(options.weights or weights)
+    if loaded.network.config.interpolates != interpolates:
+        kind, fitting = ("CNN-PS", "cnn-ps") if interpolates else ("SPLINE-Net", "spline-net")
+        problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
+        raise ModelError(problem, hint=f"Use them with --method {fitting}")
+    batch_size = {"cpu": 256, "cuda": 1024}[device.type]  # a processor computes a batch on each core
     return NetworkEstimator(
         name,
-        resolve_weights(options.weights or weights),
+        loaded,
         device=device,
         precision=choose_precision(options.precision, device),
         refines=refines,
         rotations=rotations if options.rotations is None else options.rotations,
-        batch_size=_BATCH[device.type] if options.batch_size is None else options.batch_size,
+        batch_size=batch_size if options.batch_size is None else options.batch_size,
     )
 
 
-_BATCH = {"cpu": 256, "cuda": 1024}  # Pixels in a network's batch. Processors compute a batch on each core.
-
-_METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
-    "spline-net": partial(_network, weights="spline-net", rotations=1),
-    "cnn-ps": partial(_network, weights="cnn-ps", rotations=10),
-    "ls": _least_squares,
-    "ls-trimmed": partial(_solver, fit="least_squares.solve_trimmed", batch_size=8192),
-    "l1": partial(_solver, fit="least_squares.solve_l1", batch_size=8192),
-    "iw12": partial(_solver, fit="least_squares.solve_iw12", batch_size=8192),
-    "st14": partial(_solver, fit="st14.solve_st14", batch_size=1024),
-    "ia14": partial(_solver, fit="ia14.solve_ia14", batch_size=1024),
-    "spline-net-pixelwise": partial(_network, weights="spline-net", rotations=1, refines=False),
+METHODS: dict[str, Method] = {
+    "spline-net": Method(
+        partial(_network, weights="spline-net"),
+        "LI-Net and NE-Net, the refinement nets, and indirect light removed",
+        "Zheng et al., ICCV 2019, with [changes](method.md)",
+        observation_maps=True,
+    ),
+    "cnn-ps": Method(
+        partial(_network, weights="cnn-ps", rotations=10, interpolates=False),
+        "NE-Net on the sparse observation map alone; the average of ten rotations",
+        "Ikehata, ECCV 2018",
+    ),
+    "ls": Method(
+        lambda *_: LeastSquares(),
+        "sum of squared residuals of I = L b, shadows included",
+        "Woodham, Optical Engineering 1980",
+    ),
+    "ls-trimmed": Method(
+        partial(_fit, solve="least_squares:solve_trimmed"),
+        "the same without the darkest and brightest fifth of each pixel's observations and without shadows",
+    ),
+    "l1": Method(partial(_fit, solve="least_squares:solve_l1"), "sum of absolute residuals of I = L b"),
+    "iw12": Method(
+        partial(_fit, solve="least_squares:solve_iw12"),
+        "I = L b + e with sparse e, by sparse Bayesian learning",
+        "Ikehata et al., CVPR 2012",
+    ),
+    "st14": Method(
+        partial(_fit, solve="st14:solve_st14", batch_size=1024),
+        "a bi-polynomial reflectance in n.h and l.h, fitted to the low intensities",
+        "Shi et al., TPAMI 2014",
+    ),
+    "ia14": Method(
+        partial(_fit, solve="ia14:solve_ia14", batch_size=1024),
+        "n.l as a monotone Bernstein polynomial of the observation and l.v; one quadratic programme for each pixel",
+        "Ikehata and Aizawa, CVPR 2014",
+    ),
+    "spline-net-pixelwise": Method(
+        partial(_network, weights="spline-net", refines=False),
+        "`spline-net` without the refinement nets and with indirect light",
+        observation_maps=True,
+    ),
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -12,13 +11,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.errors import ModelError, UsageError
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.errors import UsageError
+from splinecli.lights.lamp_light import LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
-from splinecli.methods.estimator import TOWARDS_CAMERA, UNKNOWN_ERROR, Directions, Observations, directions_at
+from splinecli.methods.estimator import (
+    TOWARDS_CAMERA,
+    UNKNOWN_ERROR,
+    Directions,
+    Estimator,
+    ObservationMaps,
+    Observations,
+    directions_at,
+)
 from splinecli.networks.set_branch import CaptureContext, sample_of
 from splinecli.networks.spline_net import Rotation
-from splinecli.networks.weights import LoadedNetwork
+from splinecli.networks.weights import LoadedNetwork, untrained_warning
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress
@@ -29,28 +36,18 @@ Solve = Callable[[Tensor, Tensor], Tensor]
 The normals may have any length, 0 for a pixel that has none. All observations are finite, and none is negative."""
 
 
-@dataclass(frozen=True)
-class BatchedEstimator:
+class BatchedEstimator(Estimator):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
     Each pixel is first divided by its largest observation. Thresholds and priors then mean the same for dark and bright
     pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
     """
 
-    name: str  # in the registry
-    solve: Solve
-    device: str
-    batch_size: int
-    precision: str = "float64"
-    weights: None = None
-
-    def __post_init__(self) -> None:
-        if self.batch_size < 1:
+    def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
+        if batch_size < 1:
             raise UsageError("batch size is a whole number from 1")
-
-    @property
-    def fingerprint(self) -> str:
-        return f"{self.name} {self.precision}"
+        self.name, self.device, self.batch_size, self._solve = name, device, batch_size, solve
+        self.fingerprint = f"{name} {self.precision}"
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
@@ -59,7 +56,7 @@ class BatchedEstimator:
 
         def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
             batch = batch.clamp(min=0)
-            normals = self.solve(batch / map_scale(batch), lights)
+            normals = self._solve(batch / map_scale(batch), lights)
             # The length may be tiny, and normalize would treat such a vector as zero. So divide in two steps.
             largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
             return torch.nn.functional.normalize(normals / largest, dim=1)
@@ -120,7 +117,7 @@ ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
 
 
-class NetworkEstimator:
+class NetworkEstimator(Estimator):
     """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
 
     Args:
@@ -130,9 +127,7 @@ class NetworkEstimator:
         rotations: number R of averaged estimates, see `rotations_of`.
         batch_size: pixels per batch; memory grows with it (about 0.25 MB a pixel).
 
-    Raises:
-        ModelError: the weights are the other method's.
-        UsageError: rotations or batch_size is below 1.
+    Raises UsageError if rotations or batch_size is below 1.
     """
 
     def __init__(
@@ -146,16 +141,13 @@ class NetworkEstimator:
         rotations: int = 1,
         batch_size: int = 1024,
     ) -> None:
-        interpolates = loaded.network.config.interpolates
-        if interpolates == (name == "cnn-ps"):
-            kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
-            problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
-            raise ModelError(problem, hint=f"Use them with --method {fitting}")
         if rotations < 1 or batch_size < 1:
             raise UsageError("rotations and batch size are whole numbers from 1")
-        self.name, self.weights = name, {"name": loaded.name, "sha256": loaded.sha256}
+        self.name = name
+        self.weights: dict[str, str] = {"name": loaded.name, "sha256": loaded.sha256}
         self.device, self.precision, self.batch_size = str(device), str(precision), batch_size
         self.network = loaded.network.to(device)
+        self.has_confidence = self.network.config.error_head
         refine_net = self.network.refine_net
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
@@ -167,25 +159,24 @@ class NetworkEstimator:
         self._contexts: list[CaptureContext | None] = [None] * rotations  # as each rotation shows the capture
 
     @torch.no_grad()
-    def for_capture(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
-        """Return this estimator for the pixels of one capture, of which it has seen a sample.
+    def bind(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+        """Return this estimator with the context of one capture, from a sample of its pixels; see Estimator.
 
-        Without it, the pixels of each call of `estimate` count as a capture. For the arguments, see the function
-        `for_capture`.
+        Without it, the pixels of each call of `estimate` count as a capture.
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self
         light = light_of(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
-        rows = sample_of(light.observations)
+        pixels = sample_of(light.observations)
         sample, lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
-            for values in (light.observations[rows], directions_at(light.directions, rows))
+            for values in (light.observations[pixels], directions_at(light.directions, pixels))
         )
         found = copy.copy(self)
         # One thread, so that the number of threads does not change the rounding.
         bfloat16 = torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16")
         with one_thread_each(), bfloat16:
-            found._contexts = [self.network.look_at(sample, lights, rotation) for rotation in self._rotations]
+            found._contexts = [self.network.encode_context(sample, lights, rotation) for rotation in self._rotations]
         return found
 
     def estimate(
@@ -194,21 +185,19 @@ class NetworkEstimator:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
         return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
-    @property
-    def tells_confidence(self) -> bool:
-        return self.network.config.error_head
-
     def estimate_with_error(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 
         The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
         if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
-            alone = self.for_capture(
-                lambda rows: LampLight(observations[rows], directions_at(light_directions, rows)), len(observations)
-            )
+
+            def light_of(pixels: Rows) -> LampLight:
+                return LampLight(observations[pixels], directions_at(light_directions, pixels))
+
+            alone = self.bind(light_of, len(observations))
             return alone.estimate_with_error(observations, light_directions, progress=progress)
         results = estimate_in_batches(
             self._average_rotations,
@@ -238,23 +227,14 @@ class NetworkEstimator:
         return averaged
 
     @torch.inference_mode()
-    def maps(
+    def observation_maps(
         self,
         observations: Observations,
         light_directions: Directions,
         all_observations: Observations,
         all_directions: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return the observation maps of some pixels: the network's input, LI-Net's output, and all observations.
-
-        Args:
-            observations, all_observations: (P, F) and (P, F') of the same pixels.
-            light_directions, all_directions: (F, 3) and (F', 3).
-
-        Returns:
-            The sparse maps, LI-Net's dense maps, and the sparse maps of all lights. Each is (P, w, w) in the pixels'
-            own frames, divided by the largest of the pixel's F observations, and NaN in empty cells.
-        """
+    ) -> ObservationMaps | None:
+        """Return the network's input, LI-Net's output, and the maps of all observations; see Estimator."""
         network, config = self.network, self.network.config
         seen, lights, all_seen, all_lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
@@ -262,7 +242,8 @@ class NetworkEstimator:
         )
         maps = network.build_maps(seen, lights)
         dense = network.interpolate(maps)
-        assert dense is not None, "CNN-PS has no dense maps"
+        if dense is None:
+            return None
         all_lights = all_lights.expand(len(observations), -1, 3)
         turned = rotate_about_view_axis(all_lights, maps.cosine[:, None], maps.sine[:, None])
         values = all_seen / maps.scale
@@ -272,7 +253,12 @@ class NetworkEstimator:
             return np.asarray(values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
 
         inside = network.inside.expand_as(dense)
-        return known(maps.sparse, maps.occupied), known(dense, inside), known(every.values, every.occupied)
+        of_all = known(every.values, every.occupied)
+        return ObservationMaps(known(maps.sparse, maps.occupied), known(dense, inside), of_all, config.grid)
+
+    def warn_of_lights(self, n_lights: int) -> list[str]:
+        """Return a sentence if the weights were not trained with this number of lights."""
+        return untrained_warning(self.weights["sha256"], n_lights)
 
 
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:

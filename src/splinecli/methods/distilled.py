@@ -24,13 +24,11 @@ from splinecli.methods.estimator import (
     FEWEST_PIXELS,
     TOWARDS_CAMERA,
     UNKNOWN_ERROR,
-    ConfidentEstimator,
     Directions,
+    Estimator,
     Observations,
     StudentSize,
     directions_at,
-    for_capture,
-    refiner_of,
 )
 from splinecli.networks.li_ne_net import median_error_deg
 from splinecli.system.machine import one_thread_each, side_by_side
@@ -87,8 +85,8 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
     left = order[n_even:]
     # One pixel of each group in turn, until there are enough.
     turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
-    rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
-    return PixelSample(rows, features[centres], rare, reach)
+    pixels = torch.cat((order[:n_even], left[turns[: size - n_even]]))
+    return PixelSample(pixels, features[centres], rare, reach)
 
 
 def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -196,11 +194,11 @@ class Perceptron(nn.Module):
         for _ in range(steps):
             if len(order) < BATCH:
                 order = torch.randperm(len(inputs), generator=generator)
-            rows, order = order[:BATCH].to(inputs.device), order[BATCH:]
-            found, found_errors = self(inputs[rows])
+            pixels, order = order[:BATCH].to(inputs.device), order[BATCH:]
+            found, found_errors = self(inputs[pixels])
             # The angle, not its square: the estimator's own outliers must not draw the normals of other pixels.
-            angle = (((found - normals[rows]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
-            loss = angle.mean() + 0.05 * (found_errors - errors[rows]).square().mean()
+            angle = (((found - normals[pixels]) ** 2).sum(dim=1) + _ROUNDED**2).sqrt()
+            loss = angle.mean() + 0.05 * (found_errors - errors[pixels]).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -211,11 +209,7 @@ class Perceptron(nn.Module):
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 
-_HELD_OUT = 1 / 8  # of the sample
 _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
-_RARE_SHARE = 0.01  # of the pixels, and
-_RARE_PER_SAMPLE = 2  # times the sample are the most pixels of rare kinds that go through the network
-_LARGEST_SHARE = 0.7  # of the expected error; on rendered pixels, more cost 0.3 degrees and more against the truth
 
 
 @dataclass(frozen=True)
@@ -231,38 +225,31 @@ class Distillation:
     @property
     def is_good(self) -> bool:
         """Whether the perceptron follows the network as closely as the network's own errors deserve."""
-        return self.mean_deg <= _LARGEST_SHARE * self.expected_deg
+        # On rendered pixels, more cost 0.3 degrees and more against the truth.
+        return self.mean_deg <= 0.7 * self.expected_deg
 
 
-class DistilledEstimator:
+class DistilledEstimator(Estimator):
     """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see distil."""
 
-    tells_confidence = True
+    has_confidence = True
     tile_pixels = 1 << 18
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
-        self,
-        teacher: ConfidentEstimator,
-        perceptron: Perceptron,
-        sample: PixelSample,
-        found: Distillation,
-        size: StudentSize,
+        self, teacher: Estimator, perceptron: Perceptron, sample: PixelSample, found: Distillation, size: StudentSize
     ) -> None:
         self._teacher, self._perceptron, self._sample, self._size = teacher, perceptron, sample, size
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
-        self.refiner = refiner_of(teacher)
+        self.refiner = teacher.refiner
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
-    def learn_anew(self, light_of: LightOf, n_pixels: int) -> ConfidentEstimator:
-        """Learn the capture again after its observations changed. Return the network if it cannot be learned.
-
-        The arguments are those of `distil`.
-        """
-        teacher = for_capture(self._teacher, light_of, n_pixels)
+    def rebind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+        """Learn the capture again after its observations changed. Return the network if it cannot be learned."""
+        teacher = self._teacher.bind(light_of, n_pixels)
         try:
             learned = distil(teacher, light_of, n_pixels, self._size)
         except UsageError:  # too few pixels are still lit
@@ -289,7 +276,7 @@ class DistilledEstimator:
     def estimate_with_error(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see ConfidentEstimator."""
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see Estimator."""
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
         unlike = np.empty(len(observations), np.bool_)  # the pixels that are rare, or unlike the sample
 
@@ -310,14 +297,15 @@ class DistilledEstimator:
                 progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
-            normals[unlike], errors[unlike] = self._teacher.estimate_with_error(
+            taught = self._teacher.estimate_with_error(
                 observations[unlike], directions_at(light_directions, unlike), progress=progress
             )
+            normals[unlike], errors[unlike] = taught
         return normals, errors
 
 
 def distil(
-    teacher: ConfidentEstimator,
+    teacher: Estimator,
     light_of: LightOf,
     n_pixels: int,
     size: StudentSize,
@@ -330,8 +318,8 @@ def distil(
     The result is the same for the same seed.
 
     Args:
-        light_of: gives the observations and the light directions of some pixels.
-        n_pixels: of the capture.
+        teacher: has confidence, and is bound to the capture.
+        light_of, n_pixels: see Estimator.bind.
         progress: called with numbers of pixels; in all, twice the pixels of the sample.
 
     Raises:
@@ -348,13 +336,14 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False), torch.enable_grad():
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / n_pixels)
+        # At most 1 % of the pixels, and twice the sample, are of rare kinds and go through the network.
+        rare_share = min(0.01, 2 * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
-        rows = sample.rows.numpy()
-        taught = teacher.estimate_with_error(candidates[rows], directions_at(directions, rows), progress=progress)
+        pixels = sample.rows.numpy()
+        taught = teacher.estimate_with_error(candidates[pixels], directions_at(directions, pixels), progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
         normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
-        held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all
+        held = round(len(inputs) / 8)  # the first pixels are an even sample of all
         share = len(inputs) / size.steps
         done = 0.0
 

@@ -7,8 +7,9 @@ images", 1980.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
     from splinecli.lights.lamp_light import LightOf
+    from splinecli.maths.observation_map import Grid
     from splinecli.refinement.refiner import NetworkRefiner
 
 
@@ -51,32 +53,37 @@ Directions = NDArray[np.floating]
 the camera."""
 
 
-def directions_at(light_directions: Directions, rows: slice | NDArray[Any]) -> Directions:
+def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) -> Directions:
     """Return the light directions of some pixels: those that all pixels share, or the pixels' own."""
-    return light_directions if light_directions.ndim == 2 else light_directions[rows]
+    return light_directions if light_directions.ndim == 2 else light_directions[pixels]
 
 
-class Estimator(Protocol):
-    """A method that estimates the normals of pixels from their observations.
+TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
 
-    Pixels may see others of their capture; see `for_capture`.
+
+class Estimator(ABC):
+    """A method that estimates the normals of pixels from their observations, and all hooks that a method may have.
+
+    A method without a hook inherits the one that does nothing.
 
     name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it has none.
     device, precision: where and in which number format it computes; the report states both.
     fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
+    has_confidence: whether it also estimates its own accuracy.
+    tile_pixels: the number of pixels that it gets at once.
+    refiner: what corrects its map of normals by what lies around each pixel, or None.
     """
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def weights(self) -> dict[str, str] | None: ...
-    @property
-    def device(self) -> str: ...
-    @property
-    def precision(self) -> str: ...
-    @property
-    def fingerprint(self) -> str: ...
+    name: str
+    weights: dict[str, str] | None = None
+    device: str = "cpu"
+    precision: str = "float64"
+    fingerprint: str
+    has_confidence: bool = False
+    tile_pixels: int = TILE_PIXELS
+    refiner: NetworkRefiner | None = None
 
+    @abstractmethod
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.floating]:
@@ -85,71 +92,67 @@ class Estimator(Protocol):
         A pixel that is dark under every light has no normal. It gets (0, 0, 1).
 
         Args:
+            observations: (P, F).
+            light_directions: (F, 3), or (P, F, 3).
             progress: called after each batch with the number of its pixels.
         """
-        ...
+
+    def estimate_with_error(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
+        """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
+
+        The latter are None without confidence. networks/li_ne_net.py describes the two numbers. A pixel that is dark
+        under every light gets UNKNOWN_ERROR.
+        """
+        return self.estimate(observations, light_directions, progress=progress), None
+
+    def bind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+        """Return the estimator for the pixels of one capture, which may have encoded a sample of them.
+
+        Args:
+            light_of: gives the observations and the light directions of some pixels.
+            n_pixels: of the capture.
+        """
+        return self
+
+    def rebind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+        """Return the estimator, made by `bind`, for the same capture with other observations."""
+        return self.bind(light_of, n_pixels)
+
+    def observation_maps(
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        all_observations: Observations,
+        all_directions: NDArray[np.float64],
+    ) -> ObservationMaps | None:
+        """Return the observation maps of some pixels, or None for a method without them.
+
+        Args:
+            observations, all_observations: (P, F) and (P, F') of the same pixels.
+            light_directions, all_directions: (F, 3) and (F', 3).
+        """
+        return None
+
+    def warn_of_lights(self, n_lights: int) -> list[str]:
+        """Return a sentence if the method is not made for this number of lights."""
+        return []
 
 
-TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+class ObservationMaps(NamedTuple):
+    """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation; NaN in empty cells."""
+
+    sparse: NDArray[np.float32]  # what the network gets
+    dense: NDArray[np.float32]  # what LI-Net makes of it
+    every: NDArray[np.float32]  # of all lights
+    grid: Grid
+
+
 CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
 """The distribution of the error of a normal that nothing is known of. Its confidence is 0."""
-
-
-@runtime_checkable
-class ConfidentEstimator(Estimator, Protocol):
-    """An estimator that can also estimate its own accuracy, if its weights allow that."""
-
-    @property
-    def tells_confidence(self) -> bool: ...
-
-    def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
-
-        networks/li_ne_net.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
-        """
-        ...
-
-
-def refiner_of(estimator: Estimator) -> NetworkRefiner | None:
-    """Return what corrects the estimator's map of normals by what lies around each pixel, if anything does."""
-    refiner: NetworkRefiner | None = getattr(estimator, "refiner", None)
-    return refiner
-
-
-AnyEstimator = TypeVar("AnyEstimator", bound=Estimator)
-
-
-def for_capture(estimator: AnyEstimator, light_of: LightOf, n_pixels: int) -> AnyEstimator:
-    """Return the estimator for the pixels of one capture: some see a sample of them first.
-
-    Args:
-        light_of: gives the observations and the light directions of some pixels.
-        n_pixels: of the capture.
-    """
-    look_at = getattr(estimator, "for_capture", None)
-    found: AnyEstimator = estimator if look_at is None else look_at(light_of, n_pixels)
-    return found
-
-
-def see_anew(estimator: Estimator, light_of: LightOf, n_pixels: int) -> Estimator:
-    """Return an estimator of `for_capture` for the same capture with other observations; a distilled one learns again.
-
-    The arguments are those of `for_capture`.
-    """
-    learn_anew = getattr(estimator, "learn_anew", None)
-    if learn_anew is None:
-        return for_capture(estimator, light_of, n_pixels)
-    found: Estimator = learn_anew(light_of, n_pixels)
-    return found
-
-
-def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:
-    """Return whether the estimator can estimate its own accuracy."""
-    return isinstance(estimator, ConfidentEstimator) and estimator.tells_confidence
 
 
 def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -164,15 +167,10 @@ def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
 TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is dark under every light
 
 
-@dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(Estimator):
     """Minimise |I - L b| over all observations, including shadows; n = b / |b|. In float64 on the CPU."""
 
-    name: str = "ls"
-    weights: None = None
-    device: str = "cpu"
-    precision: str = "float64"
-    fingerprint: str = "ls"
+    name = fingerprint = "ls"
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None

@@ -102,10 +102,8 @@ def median_error_deg(error: Tensor) -> Tensor:
 
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features of confidence.py
-_BEND_TURN = 11  # the place of CaptureFeatures.bend_turn
 _MOST = 4.0  # standard deviations of a feature from its mean
 _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES
-_NO_ERROR = -3.5  # logarithm of the median error, in radians, that is added before training
 
 
 class CaptureHead(nn.Module):
@@ -131,7 +129,7 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            self.linear.bias[1] = _NO_ERROR
+            self.linear.bias[1] = -3.5  # before training, the logarithm of the median error in radians
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
         """Return the changed distributions (P, 2).
@@ -146,7 +144,7 @@ class CaptureHead(nn.Module):
         found = self.linear(inputs) + self.last(self.hidden(inputs).tanh())
         median = torch.logaddexp(errors[:, 0] + found[:, 0], found[:, 1])
         # However well all else fits: encoded values turn the normals by about so much.
-        bent = capture[..., _BEND_TURN] + math.log(math.pi / 180) + self.bend
+        bent = capture[..., 11] + math.log(math.pi / 180) + self.bend  # the place of CaptureFeatures.bend_turn
         median = torch.logaddexp(median, bent.expand(len(errors)))
         return torch.stack((median, errors[:, 1] + found[:, 2]), dim=1)
 

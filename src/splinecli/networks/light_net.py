@@ -11,7 +11,6 @@ INPUTS = 4
 _WIDTHS = 24, 48, 96, 128
 _JOINED = 64
 _HIDDEN = 192
-_LEAST_SHARPNESS, _LARGEST_SHARPNESS = -2.0, 8.5  # logarithms; errors of 90 degrees and of 1 degree
 
 
 class LightGuess(NamedTuple):
@@ -60,7 +59,8 @@ class LightNet(nn.Module):
         x = torch.relu(x + self.join3(_with_all(x, lights)))
         found = self.out(x).view(captures, lights, 6)
         height = softplus(found[..., 2:3] + 1)
-        sharpness = (3 + found[..., 3]).clamp(_LEAST_SHARPNESS, _LARGEST_SHARPNESS)
+        # Errors of 90 degrees and of 1 degree
+        sharpness = (3 + found[..., 3]).clamp(-2.0, 8.5)
         intensities = found[..., 4] - found[..., 4].mean(dim=1, keepdim=True)
         return LightGuess(normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities)
 

@@ -80,14 +80,11 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
 
 WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
 ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks of each scale on the way down
-DECODING_BLOCKS = (1, 1, 0)  # and on the way up
 SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of the smoothed normals that the net weighs against the estimated one
 
 # Logarithms of errors in radians, for the weights of the smoothing.
 _LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
 COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of the coarsest scale's pixels. The origins of tiles are multiples of it.
-_REACH = 96  # of one net
-_DECODED = 4  # pixels of each scale that the decoder needs around a part of the map, at least
 Part = tuple[slice, slice]  # rows and columns of a map
 
 
@@ -118,11 +115,11 @@ class RefineNet(nn.Module):
         )
         self.decode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
-            for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
+            for width, count in zip(WIDTHS, (1, 1, 0), strict=False)  # and on the way up
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
         self.again = RefineNet() if twice else None
-        self.reach = _REACH * (1 + twice)
+        self.reach = 96 * (1 + twice)  # of one net
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H, W) of 1 and 0.
@@ -164,7 +161,8 @@ class RefineNet(nn.Module):
                 x = block(x, masks[scale])
         origin = (0, 0)
         for scale in reversed(range(len(passed))):
-            wanted = _grown(inner, _DECODED << scale)
+            # Pixels of each scale that the decoder needs around a part of the map, at least
+            wanted = _grown(inner, 4 << scale)
             within = masks[scale][_cells(wanted, (0, 0), scale)]
             x = self.up[scale](x[_cells(wanted, origin, scale + 1)])
             x = interpolate(x, scale_factor=2, mode="nearest").mul_(within)

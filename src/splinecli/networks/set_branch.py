@@ -22,7 +22,6 @@ SAMPLE = 256  # pixels of a capture that its other pixels see
 
 _DARK_SHARE = 0.02  # see lit_values. Darker pixels, such as a black background, say nothing
 _LARGEST_LOG = 7.0  # of a pixel's brightness over that of its capture
-_HEADS = 4
 
 
 class Summary(NamedTuple):
@@ -44,8 +43,8 @@ def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the rows of the pixels, with observations (P, F), that the others see: at most SAMPLE lit ones, evenly
     spread. Where none is lit, the first one stands for all.
     """
-    rows, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
-    return rows if len(rows) else np.zeros(1, np.intp)
+    pixels, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
+    return pixels if len(pixels) else np.zeros(1, np.intp)
 
 
 def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
@@ -99,10 +98,9 @@ class ContextLayer(nn.Module):
 
 def _split(tokens: Tensor) -> Tensor:
     """Split tokens (G, P, width) into heads (G, heads, P, width / heads)."""
-    return tokens.view(*tokens.shape[:2], _HEADS, -1).transpose(1, 2)
+    return tokens.view(*tokens.shape[:2], 4, -1).transpose(1, 2)
 
 
-DARKEST = 1e-3  # added to observations before their logarithm is taken
 _PRIOR = 1e-4  # keeps the weighted least squares solvable where the weights leave fewer than three lights
 
 
@@ -146,7 +144,7 @@ class SetBranch(nn.Module):
         capture see each other.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
-        log_observed = (observed.clamp(min=0) + DARKEST).log()
+        log_observed = (observed.clamp(min=0) + 1e-3).log()  # added to observations before their logarithm is taken
         values = torch.stack((observed, log_observed, residual), dim=-1)
         features = torch.cat((lights, values, lights @ normals.mT, half @ normals.mT), dim=-1)
         count = observed.shape[1] if valid is None else valid.sum(dim=1, keepdim=True)

@@ -161,8 +161,8 @@ class SplineNet(nn.Module):
     ) -> Estimate:
         """Return the normals of NE-Net in the pixels' frames, and their errors.
 
-        Pixel p belongs to capture p % `captures`. The context is that of `look_at`; without one, the pixels of each
-        capture see each other, if the network sees captures at all.
+        Pixel p belongs to capture p % `captures`. The context is that of `encode_context`; without one, the pixels of
+        each capture see each other, if the network sees captures at all.
         """
         interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
@@ -187,8 +187,8 @@ class SplineNet(nn.Module):
         """Return normals in the capture's frame, and their errors.
 
         The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
-        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context is that of `look_at`; without one, all
-        pixels see each other, if the network sees captures. See build_maps for the others.
+        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context is that of `encode_context`; without
+        one, all pixels see each other, if the network sees captures. See build_maps for the others.
         """
         # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
@@ -196,7 +196,7 @@ class SplineNet(nn.Module):
         normals, error = self.estimate(maps, self.interpolate(maps), context=context)
         return Estimate(to_capture_frame(normals, maps), error)
 
-    def look_at(
+    def encode_context(
         self, observations: Tensor, light_directions: Tensor, rotation: Rotation = NO_ROTATION
     ) -> CaptureContext | None:
         """Return what a sample of a capture's pixels says about the others; None if the network sees no captures.

@@ -44,7 +44,6 @@ LONGEST = 500_000_000
 """Bytes of the longest file of tensors that is read; a checkpoint of the paper's networks has 170 MB."""
 
 _LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
-_LONGEST_HEADER = 1 << 20  # bytes; a tensor has about 100
 Module = TypeVar("Module", bound=nn.Module)
 
 SHIPPED = resources.files("splinecli") / "assets"
@@ -112,7 +111,7 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
             raise ModelError("no such file", path=path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
-            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > _LONGEST_HEADER:
+            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > 1 << 20:  # a tensor has about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}

@@ -1,4 +1,4 @@
-"""Pictures of maps, of balls of a calibration, and of the scenes of a pixel set, as PNG files."""
+"""Pictures of maps and of the scenes of a pixel set, and PNG files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.images import read_image
 from splinecli.errors import OutputError
 from splinecli.maths import Bools, Floats, Singles
 from splinecli.maths.normals import encode_picture, unit
 from splinecli.maths.transfer import encode_srgb
 
 if TYPE_CHECKING:
-    from splinecli.calibration.balls import BallCalibration
     from splinecli.pixel_sets.store import Entry, PixelSet
 
 Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
@@ -48,19 +46,11 @@ def encode_png(
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-WHITE_QUANTILE = 0.99  # of the largest channel: this albedo is white in a picture
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # by default white in a picture: mean curvature in 1/pixel, relief in pixels
 
 TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
 
 TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) for third in range(4)}
 TITLE = "angular error (deg)"
-
-_SMALLEST_HEIGHT = 256  # pixels: room for the colour bar and its text
-_LARGEST_ENLARGED = 1024  # pixels: a small map is not enlarged beyond this width
-_TEXT_SIZE = 0.45  # OpenCV's font scale in a picture of _USUAL_HEIGHT; capitals are 10 pixels high
-_USUAL_HEIGHT = 400
-_BACKGROUND, _INK = 255, 0
 
 
 def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
@@ -68,11 +58,12 @@ def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
     """
-    white = max(float(np.quantile(albedo[mask].max(axis=1), WHITE_QUANTILE)), 1e-12)
+    # The brightest 1 % are white.
+    white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
 
 
-def confidence_picture(confidence_map: Singles) -> Picture:
+def confidence_picture(confidence_map: Singles, _: Bools | None = None) -> Picture:
     """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
     return np.rint(255 * confidence_map).astype(np.uint8)
 
@@ -86,25 +77,11 @@ def preview_picture(normal_map: Singles, mask: Bools) -> Picture:
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-def signed_picture(values: Singles, scale: float) -> Picture:
-    """Return values (H, W) as a gray picture (H, W): 0 and NaN are gray, -scale is black, scale is white."""
-    share = np.nan_to_num(values / scale).clip(-1, 1)
+def signed_picture(values: Singles, _: Bools, scale: float) -> Picture:
+    """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale black, scale white."""
+    first = values if values.ndim == 2 else values[..., 0]
+    share = np.nan_to_num(first / scale).clip(-1, 1)
     return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)
-
-
-def error_map_picture(error_map_deg: Floats) -> Picture:
-    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its right.
-
-    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to
-    256 rows.
-    """
-    picture = colour_errors(error_map_deg)
-    height, width = picture.shape[:2]
-    factor = max(1, min(-(-_SMALLEST_HEIGHT // height), _LARGEST_ENLARGED // width))
-    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
-    missing = max(0, _SMALLEST_HEIGHT - len(picture))
-    picture = np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=_BACKGROUND)
-    return np.hstack([picture, _colour_bar(len(picture))])
 
 
 def colour_errors(error_map_deg: Floats) -> Picture:
@@ -115,7 +92,7 @@ def colour_errors(error_map_deg: Floats) -> Picture:
     shares = np.where(known, error_map_deg, 0) / TOP_DEG
     levels = np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
     picture: Picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
-    picture[~known] = _BACKGROUND
+    picture[~known] = 255
     return picture
 
 
@@ -125,100 +102,6 @@ def bounding_box(mask: Bools) -> tuple[slice, slice]:
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _colour_bar(height: int) -> Picture:
-    """Return the colour bar with ticks, labels and a vertical title: (height, W, 3), W as large as needed."""
-    scale = max(1.0, height / _USUAL_HEIGHT)
-    texts = [_text(label, scale) for label in TICKS.values()]
-    title = np.rot90(_text(TITLE, scale))
-    gap, bar_width, line = round(8 * scale), round(18 * scale), max(1, round(scale))
-    margin = texts[0].shape[0]  # keeps the outermost labels whole
-    bar_height = height - 2 * margin
-
-    label_x = 3 * gap + bar_width
-    title_x = label_x + max(text.shape[1] for text in texts) + gap
-    panel = np.full((height, title_x + title.shape[1] + gap, 3), _BACKGROUND, np.uint8)
-    column = np.linspace(TOP_DEG, 0, bar_height)[:, None].repeat(bar_width, axis=1)
-    panel[margin : margin + bar_height, 2 * gap : 2 * gap + bar_width] = colour_errors(column)
-    for value, text in zip(TICKS, texts, strict=True):
-        y = margin + round((1 - value / TOP_DEG) * (bar_height - 1))
-        top = min(y - line // 2, margin + bar_height - line)
-        panel[top : top + line, 2 * gap + bar_width : label_x - gap // 2] = _INK
-        _paste(panel, text, y - text.shape[0] // 2, label_x)
-    _paste(panel, title, (height - title.shape[0]) // 2, title_x)
-    return panel
-
-
-def _text(text: str, scale: float) -> Picture:
-    """Return a line of text (h, w), black on white, without margins."""
-    import cv2
-
-    font, size, thickness = cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE * scale, max(1, round(scale))
-    (width, height), below = cv2.getTextSize(text, font, size, thickness)
-    canvas = np.full((height + below + 2 * thickness, width + 2 * thickness), _BACKGROUND, np.uint8)
-    cv2.putText(canvas, text, (thickness, height + thickness), font, size, _INK, thickness, cv2.LINE_AA)
-    # OpenCV 4 and 5 have different fonts and report different heights, so crop to the drawn pixels.
-    return canvas[bounding_box(canvas < _BACKGROUND)]
-
-
-def _paste(panel: Picture, gray: Picture, y: int, x: int) -> None:
-    height, width = gray.shape
-    panel[y : y + height, x : x + width] = gray[..., None]
-
-
-BALL_TILE = 200  # width and height of one ball in the picture, in pixels
-_MARGIN = 1.15  # half of a tile's width, in radii of the ball
-_CAPTION = 22  # height of the caption below each tile
-_BRIGHTENING = 0.4  # exponent; makes the outline of a dark ball visible
-_GREEN, _RED, _GRAY = (90, 200, 90), (255, 60, 60), (230, 230, 230)
-
-
-def calibration_picture(balls: tuple[BallCalibration, ...]) -> Picture:
-    """Return a picture (H, W, 3) of all images of all balls, in rows of up to six images.
-
-    The green circle is the outline and the red one the highlight. The red line from the centre to the highlight points
-    towards the lamp. The caption has the number of the image, from 1, and the light direction x, y, z.
-    """
-    columns = min(6, max(len(ball.directions) for ball in balls))
-    rows = []
-    for ball in balls:
-        tiles = [_tile(ball, number) for number in range(len(ball.directions))]
-        empty = np.zeros_like(tiles[0])
-        for start in range(0, len(tiles), columns):
-            row = tiles[start : start + columns]
-            rows.append(np.hstack(row + [empty] * (columns - len(row))))
-    return np.vstack(rows)
-
-
-def _tile(ball: BallCalibration, number: int) -> Picture:
-    import cv2
-
-    path, circle, highlight = ball.files.images[number], ball.circle, ball.highlights[number]
-    values = read_image(path).mean(axis=2)
-    reach = _MARGIN * circle.radius
-    scale = BALL_TILE / (2 * reach)
-    # The transformation from the tile to the image; pixel centres are at whole numbers in both.
-    shift = 0.5 / scale - 0.5
-    to_image = np.array([[1 / scale, 0, circle.x - reach + shift], [0, 1 / scale, circle.y - reach + shift]])
-    gray = cv2.warpAffine(values, to_image, (BALL_TILE, BALL_TILE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    gray = (255 * (gray / max(float(gray.max()), 1e-9)) ** _BRIGHTENING).astype(np.uint8)
-    tile = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
-
-    def place(x: float, y: float) -> tuple[int, int]:
-        return round((x - circle.x + reach) * scale), round((y - circle.y + reach) * scale)
-
-    centre, mark = place(circle.x, circle.y), place(highlight.x, highlight.y)
-    cv2.circle(tile, centre, round(circle.radius * scale), _GREEN, 1, cv2.LINE_AA)
-    cv2.line(tile, centre, mark, _RED, 1, cv2.LINE_AA)
-    cv2.circle(tile, mark, 6, _RED, 1, cv2.LINE_AA)
-    caption = np.zeros((_CAPTION, BALL_TILE, 3), np.uint8)
-    x, y, z = ball.directions[number]
-    text = f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}"
-    cv2.putText(caption, text, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _GRAY, 1, cv2.LINE_AA)
-    return np.vstack((tile, caption)).astype(np.uint8)
-
-
-SCENE_TILE = 96  # pixels: large enough to recognise shapes and materials; sixty scenes fit on a screen or two
-LARGE_TILE, FEW_SCENES = 160, 12
 MOST_SCENES = 120
 _LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
 
@@ -229,7 +112,8 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
     for entry in pixel_set.entries:
         scenes.setdefault(entry.scene, []).append(entry)
     every = -(-len(scenes) // MOST_SCENES)
-    tile = LARGE_TILE if len(scenes) <= FEW_SCENES else SCENE_TILE
+    # Large enough to recognise shapes and materials; sixty scenes fit on a screen or two.
+    tile = 160 if len(scenes) <= 12 else 96
     with np.errstate(all="ignore"):  # a damaged array may have NaN
         strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
     width = max(strip.shape[1] for strip in strips)

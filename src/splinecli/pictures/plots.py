@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from splinecli.capture.formats.images import read_image
 from splinecli.errors import printable
 from splinecli.maths import Bools, Doubles, Floats, Integers
 from splinecli.maths.normals import encode_picture, unit
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from splinecli.calibration.balls import BallCalibration
     from splinecli.maths.observation_map import Grid
 
 
@@ -95,7 +97,6 @@ def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
 
 
 _MAP_INCHES = 1.7
-_EMPTY = "0.85"  # light gray, which the colour scale does not contain
 _SMALL, _LARGE = 8, 9  # points
 
 
@@ -153,7 +154,7 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
 
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_facecolor(_EMPTY)
+    axes.set_facecolor("0.85")  # light gray, which the colour scale does not contain
     # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
     # stand for a single line each.
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
@@ -161,8 +162,6 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
         centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
     axes.add_patch(Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False))
 
-
-_LARGEST_LINEAR_RATIO = 20  # An axis whose values span more is logarithmic.
 
 Columns = Mapping[str, Sequence[float | None]]
 
@@ -207,16 +206,11 @@ def _finish_curves(axes: Axes) -> None:
     axes.grid(alpha=0.3)
     axes.legend()
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-    if (values > 0).all() and values.max() > _LARGEST_LINEAR_RATIO * values.min():
+    if (values > 0).all() and values.max() > 20 * values.min():  # An axis whose values span more is logarithmic.
         axes.set_yscale("log")
 
 
 _MOST_WIDE = 3600  # pixels, all columns without gaps: the picture stays below 4000
-_MOST_HIGH = 1200  # pixels: one map
-_ENLARGED = 240  # pixels: small maps are enlarged while their longer side stays within it
-_SMALLEST_CELL = 150  # pixels: room for the colour bar and a name
-_LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
-_TEXT_WIDTH = 0.62  # of its height: the average width of a character
 _MAPS_DPI = 100
 _POINT = _MAPS_DPI / 72  # pixels
 
@@ -249,7 +243,7 @@ def method_maps(
     errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
-    cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
+    cell_height, cell_width = (max(side, 150) for side in truth.shape[:2])  # pixels: room for the colour bar and a name
     text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
     gap, line = text // 2, 2 * text
     errors_at = gap + line  # from the bottom, as in matplotlib
@@ -264,7 +258,7 @@ def method_maps(
 
     show(truth, gap, normals_at)
     _write(figure, gap + cell_width / 2, names_at + text, "ground truth", text)
-    _draw_bar(figure, gap + cell_width, errors_at, cell_height, text)
+    _draw_bar(figure, gap + cell_width - text, errors_at, cell_height, text)
     for column, name in enumerate(normal_maps, start=1):
         left = gap + column * (cell_width + gap)
         show(normals[name], left, normals_at)
@@ -275,16 +269,76 @@ def method_maps(
     return png_bytes(figure, _MAPS_DPI)
 
 
-def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -> None:
-    """Draw a vertical colour bar of errors with its right edge at `right`, and its labels and title on the left."""
+def _draw_bar(figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1) -> None:
+    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title to one side of it."""
     inset = text // 2  # room for half a label at either end
-    length = height - 2 * inset
+    length, edge = height - 2 * inset, left + text * (side > 0)
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
-    figure.figimage(colour_errors(column), right - text, bottom + inset, origin="lower")
+    figure.figimage(colour_errors(column), left, bottom + inset, origin="lower")
     for value, label in TICKS.items():
-        _write(figure, right - 1.4 * text, bottom + inset + value / TOP_DEG * (length - 1), label, text, ha="right")
+        y = bottom + inset + value / TOP_DEG * (length - 1)
+        _write(figure, edge + side * 0.4 * text, y, label, text, ha="left" if side > 0 else "right")
     size = _text_height(height, [TITLE], most=text)
-    _write(figure, right - 4 * text, bottom + height / 2, TITLE, size, rotation=90)
+    _write(figure, edge + side * 3 * text, bottom + height / 2, TITLE, size, rotation=90)
+
+
+def error_map_picture(error_map_deg: Floats) -> Picture:
+    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its right.
+
+    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to
+    256 rows.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    picture = colour_errors(error_map_deg)
+    height, width = picture.shape[:2]
+    factor = max(1, min(-(-256 // height), 1024 // width))
+    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    missing = max(0, 256 - len(picture))
+    picture = np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255)
+    height = len(picture)
+    text = max(18, height // 22)
+    panel = Figure(figsize=(6 * text / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
+    canvas = FigureCanvasAgg(panel)
+    _draw_bar(panel, text, text // 2, height - text, text, side=1)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
+    return np.hstack([picture, drawn])
+
+
+def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
+    """Return a PNG file with all images of all balls, in rows of up to six.
+
+    The green circle is the outline and the red one the highlight. The red line from the centre to the highlight points
+    towards the lamp. The title has the number of the image, from 1, and the light direction x, y, z.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
+
+    columns = min(6, max(len(ball.directions) for ball in balls))
+    places = [-(-len(ball.directions) // columns) for ball in balls]
+    figure = Figure(figsize=(2 * columns, 2.25 * sum(places)), layout="constrained")
+    grid = figure.subplots(sum(places), columns, squeeze=False)
+    for axis in grid.flat:
+        axis.set_axis_off()
+    for first, ball in zip(np.cumsum([0, *places]), balls, strict=False):
+        for number, (x, y, z) in enumerate(ball.directions):
+            axis, circle, highlight = grid[first:].flat[number], ball.circle, ball.highlights[number]
+            reach = 1.15 * circle.radius
+            left, top = max(0, int(circle.x - reach)), max(0, int(circle.y - reach))
+            image = read_image(ball.files.images[number])
+            image = image[top : int(circle.y + reach) + 2, left : int(circle.x + reach) + 2]
+            gray = image.mean(axis=2) ** 0.4  # so that the outline of a dark ball shows
+            height, width = gray.shape
+            extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
+            axis.imshow(gray, cmap="gray", vmin=0, extent=extent)
+            axis.set(xlim=(circle.x - reach, circle.x + reach), ylim=(circle.y + reach, circle.y - reach))
+            axis.add_patch(Circle((circle.x, circle.y), circle.radius, fill=False, color="#5AC85A"))
+            axis.plot([circle.x, highlight.x], [circle.y, highlight.y], color="#FF3C3C", linewidth=1)
+            axis.plot(highlight.x, highlight.y, "o", color="#FF3C3C", markersize=6, fillstyle="none")
+            axis.set_title(f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}", fontsize=_SMALL)
+    return png_bytes(figure, 100)
 
 
 def _write(
@@ -297,16 +351,17 @@ def _write(
     figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
 
 
-def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
+def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
     """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
     longest = max(18, *(len(line) for line in lines))
-    return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
+    return min(most, max(10, int(width / (0.62 * longest))))  # characters are 0.62 of their height wide
 
 
 def _scale(height: int, width: int, columns: int) -> float:
     """Return the factor of enlargement: a whole number, or less than 1."""
-    most = min(_MOST_WIDE / columns / width, _MOST_HIGH / height)
-    return most if most < 1 else max(1, min(int(most), _ENLARGED // max(height, width)))
+    most = min(_MOST_WIDE / columns / width, 1200 / height)  # a map has at most 1200 rows
+    # Small maps are enlarged while their longer side stays within 240 pixels.
+    return most if most < 1 else max(1, min(int(most), 240 // max(height, width)))
 
 
 def _resize(picture: Picture, scale: float) -> Picture:

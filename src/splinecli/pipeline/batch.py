@@ -17,10 +17,11 @@ from typing import Any, Literal
 
 from splinecli import __version__
 from splinecli.capture import capture_name
-from splinecli.capture.files import MAPS, NORMALS, OWN_FILES, REPORT
+from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
+from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import (
@@ -52,9 +53,12 @@ class Member:
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
     """Return the captures in the order given. A folder that is given twice counts once.
 
-    Raises UsageError if two captures have the same name, or a "folder" that does not exist is the name of a map, format
-    or method.
+    Raises UsageError if images are given in place of their folder, two captures have the same name, or a "folder" that
+    does not exist is the name of a map, format or method.
     """
+    if folders and all(path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path) for path in folders):  # noqa: PTH113
+        given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
+        raise UsageError(f"{given} given, expected their folder", hint=f"Pass the folder: {folders[0].parent}")
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)
     if shard is not None:
@@ -198,7 +202,7 @@ def find_earlier(
         if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
             raise ValueError
     except UnfinishedError as error:
-        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        found = next((name for name in own_files() if (target / name).exists()), None)
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
@@ -219,9 +223,6 @@ def find_earlier(
     if stamp != inputs_sha256(options.open(folder), options.weights):
         raise ChangedError("from other input files", target)
     return report
-
-
-_ASKED = 16  # captures that stand for a batch
 
 
 def infer_batch(
@@ -366,6 +367,6 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
     """
     if choose_device(options.device).type == "cuda":
         return 1
-    asked = members[:: max(1, len(members) // _ASKED)]
+    asked = members[:: max(1, len(members) // 16)]  # captures that stand for a batch
     each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
     return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

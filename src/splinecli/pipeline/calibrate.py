@@ -6,11 +6,11 @@ from typing import Any
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.lamps import calibration_report, measure_light_intensities, summary_lines, triangulate_lamps
-from splinecli.capture.files import CALIBRATION
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.pictures.maps import calibration_picture, encode_png
+from splinecli.output_files import CALIBRATION
+from splinecli.pictures.plots import calibration_picture
 from splinecli.pipeline.options import CalibrateOptions
 from splinecli.system.files import check_free
 from splinecli.system.progress import SILENT, Observer
@@ -73,7 +73,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
         for name, text in texts.items():
             new.write(name, text)
-        new.write(PICTURE, encode_png(calibration_picture(lights.balls)))
+        new.write(PICTURE, calibration_picture(lights.balls))
     for line in summary_lines(report):
         observer.say(line)
     if intensities is not None:

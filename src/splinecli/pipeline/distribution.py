@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-RETRIES = 2  # of an item whose worker of this machine was lost; a running cluster has a setting of its own
 _CONNECT_SECONDS = 5.0
 _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
@@ -110,7 +109,8 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         **_QUIET,
-        "distributed.scheduler.allowed-failures": RETRIES,
+        # An item whose worker was lost is tried again twice. A running cluster has a setting of its own.
+        "distributed.scheduler.allowed-failures": 2,
         "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
         # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives it up.
@@ -162,8 +162,6 @@ SAME_STORAGE = "Workers need the storage of this machine at the same place, for 
 SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 _LOOK_SECONDS = 0.5  # between two looks at which workers there are
-_NO_WORKER_SECONDS = 60.0  # after which a cluster of this machine counts as lost
-_PROBE_SECONDS = 3.0  # a network drive may show a new file a little later
 
 _ONE_AT_A_TIME = Lock()  # item of a worker: the working folder and PyTorch's threads belong to the process
 
@@ -207,7 +205,7 @@ class Work:
             raise InputError(
                 f"the folder cannot be entered ({error.strerror})", path=self.folder, hint=SAME_STORAGE
             ) from None
-        deadline = time.monotonic() + _PROBE_SECONDS
+        deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
                 raise InputError("the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE)
@@ -262,7 +260,8 @@ class Distributor:
             workers = self._workers()
             if workers:
                 began = time.monotonic()
-            elif not self.options.address and time.monotonic() - began > _NO_WORKER_SECONDS:
+            # A cluster of this machine counts as lost after a minute.
+            elif not self.options.address and time.monotonic() - began > 60.0:
                 raise SplinecliError(
                     "the workers end while they are getting ready",
                     hint="If there is too little memory, use fewer. Dask's output says more",

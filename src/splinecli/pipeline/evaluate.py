@@ -17,7 +17,6 @@ from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
 from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
 from splinecli.methods import Estimator, MethodOptions, make_estimator
-from splinecli.networks.weights import untrained_warning
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.infer import source_bytes
 from splinecli.pipeline.infer_options import ClusterOptions
@@ -76,9 +75,8 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
         document = write_results(output, evaluations, figures)
-    used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
-    untrained = [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]
+    untrained = [warning for estimator in estimators for k in counts for warning in estimator.warn_of_lights(k)]
     return EvaluateOutcome(evaluations, document, untrained, problems)
 
 

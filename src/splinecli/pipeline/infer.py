@@ -6,7 +6,7 @@ estimator replaces a network on large captures, or where the user asks for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -15,28 +15,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.files import FOUND_LIGHTS, FOUND_MASK, PAGE, digest
+from splinecli.capture.files import digest
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
-from splinecli.capture_warnings import NOT_DISTILLED, PROBABLY_WRONG, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
 from splinecli.inference import NormalEstimate, estimate_normals, find_surface, light_on
 from splinecli.lights.light_fit import refine_capture
 from splinecli.methods import Estimator, make_estimator
-from splinecli.methods.estimator import FEWEST_PIXELS, for_capture, student_sizes, tells_confidence
-from splinecli.pictures.maps import albedo_picture, encode_png
+from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
+from splinecli.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
+from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.integrate import BYTES_OF_SURFACE, make_surface, view_of_report
+from splinecli.pipeline.integrate import make_surface, view_of_report
 from splinecli.results import files
-from splinecli.results.files import albedo_map, report_of
+from splinecli.results.files import report_of
+from splinecli.results.maps import chosen_maps, make_map, map_files, map_picture
 from splinecli.results.pages import result_page
-from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
@@ -99,13 +101,13 @@ def distil_for(
     """
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
-    if not tells_confidence(estimator):
+    if not estimator.has_confidence:
         return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     light_of = partial(light_on(capture), None)
-    teacher = for_capture(estimator, light_of, capture.n_pixels)
+    teacher = estimator.bind(light_of, capture.n_pixels)
     from splinecli.methods.distilled import distil
 
     for size in sizes:
@@ -159,7 +161,7 @@ def estimate_capture(
     if refine_lights is not None:
         before = len(capture.warnings)
         capture = refine_lights(capture)
-        warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
+        warnings = [warning for warning in warnings if warning.kind != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
     capture = replace(capture, warnings=tuple(warnings))
     clock.begin("estimate")
@@ -175,21 +177,13 @@ def estimate_capture(
 
         advance = stages.enter_context(stage("estimating"))
         estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
-    if estimator.weights is not None:
-        from splinecli.networks.weights import untrained_warning
-
-        texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
-        found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
     warnings += found
+    warnings += [CaptureWarning(UNTRAINED_LIGHTS, text) for text in estimator.warn_of_lights(capture.n_lights)]
     # Others of these say why the confidence is low.
-    if not any(warning.error_deg and warning.code in PROBABLY_WRONG for warning in warnings):
+    if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled
-
-
-_BYTES_OF_ALBEDO = 52
-"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
 
 
 def infer_capture(
@@ -239,6 +233,8 @@ def infer_capture(
             light_file=source.files.light_directions,
             distillation=None if distilled is None else distilled.report(),
         )
+        if source.light_numbers is not None:
+            report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
         found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
@@ -271,8 +267,9 @@ def make_method(options: InferOptions) -> Estimator:
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:
         raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
-    if "confidence" in options.maps and not tells_confidence(estimator):
-        raise UsageError(f"method {options.method} gives no confidence", hint="Leave confidence out of --maps")
+    for name in options.maps:
+        if MAPS[name].needs_confidence and not estimator.has_confidence:
+            raise UsageError(f"method {options.method} gives no {name}", hint=f"Leave {name} out of --maps")
     return estimator
 
 
@@ -282,7 +279,7 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
     if options.auto_mask:
         with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
             source = source.find_mask(lambda: advance(1))
-    indices = options.light_indices
+    indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
@@ -293,15 +290,15 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
     """Raise InputError, before hours of work, for results that take more memory than is left, or an empty mesh."""
-    albedo = "albedo" in options.maps or options.html
-    surface = options.surface or "relief" in options.maps
+    costly = [row.name for row in chosen_maps(options.maps, page=options.html) if row.bytes_per_pixel]
+    avoidable = [f"--maps {name}" for name in costly if name in options.maps]
+    avoidable += ["--html"] * options.html + ["--surface"] * options.surface
     check_memory(
-        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo, surface=surface),
+        results_bytes(capture.n_pixels, capture.n_lights, maps=costly, surface=options.surface),
         f"the results of {capture.n_pixels} pixels take",
         folder,
         hint="Mask the object, or use --scale or --crop"
-        + (", or leave --surface out" if options.surface else ", or relief in --maps" if surface else "")
-        + (", or neither albedo in --maps nor --html" if albedo else ""),
+        + (f", or leave out {' and '.join(avoidable)}" if avoidable else ""),
     )
     if options.surface:
         check_triangles(capture.mask, folder)
@@ -329,21 +326,23 @@ def _make_files(
 ) -> list[Iterable[tuple[str, Content]]]:
     """Compute what the options ask for, put what the report says of the surface into it, and return the files."""
     capture = estimate.capture
+    clock.begin("pictures")
+    made: dict[str, NDArray[np.float32]] = {}
+    for row in chosen_maps(options.maps, page=options.html):
+        if not (row.bytes_per_pixel or (options.html and row.caption)):
+            continue  # it is made when it is written
+        if row.reads_images:
+            with observer.progress(f"{capture.name}: {row.name}", capture.n_lights) as advance:
+                values = make_map(row, source, estimate, lambda: advance(1))
+        else:
+            values = make_map(row, source, estimate)
+        if values is not None:
+            made[row.name] = values
+    scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
     found: list[Iterable[tuple[str, Content]]] = [
         files.normal_files(estimate, options.formats, options.convention),
-        files.map_files(estimate, options.maps, options.curvature_scale, tiff="tiff" in options.formats),
+        *(_map_files(row, made, source, estimate, options.formats, scales) for row in chosen_maps(options.maps)),
     ]
-    albedo = colours = None
-    clock.begin("pictures")
-    if "albedo" in options.maps or options.html:
-        with observer.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
-            albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
-        colours = albedo_picture(albedo, capture.mask)
-        if "albedo" in options.maps:
-            found.append(files.albedo_files(albedo, capture.mask, exr="exr" in options.formats))
-    if "relief" in options.maps:
-        relief = relief_of_normals(estimate.normal_map, capture.mask)
-        found.append(files.relief_files(relief, options.relief_scale, tiff="tiff" in options.formats))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
@@ -353,6 +352,7 @@ def _make_files(
     if options.surface:
         clock.begin("surface")
         camera_matrix, pixel_size = view_of_report(report)
+        colours = map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
         with observer.progress(f"{capture.name}: integrating", 1) as advance:
             surface, report["surface"] = make_surface(
                 estimate.normal_map,
@@ -371,8 +371,7 @@ def _make_files(
             {**report, "seconds": clock.seconds()},
             estimate.normal_map,
             capture.mask,
-            albedo=albedo,
-            confidence_map=estimate.confidence_map,
+            values={name: made[name] for name, row in MAPS.items() if name in made and row.caption},
             error_map_deg=estimate.error_map_deg,
             light_plot=light_plot,
         )
@@ -380,8 +379,22 @@ def _make_files(
     return found
 
 
-def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface: bool = False) -> int:
+def _map_files(
+    row: OutputMap,
+    made: Mapping[str, NDArray[np.float32]],
+    source: CaptureSource,
+    estimate: NormalEstimate,
+    formats: Sequence[str],
+    scales: Mapping[str, float],
+) -> Iterator[tuple[str, Content]]:
+    """Yield the files of a map, which is made now if it was not made before."""
+    values = made[row.name] if row.name in made else make_map(row, source, estimate)
+    if values is not None:
+        yield from map_files(row, values, estimate.capture.mask, formats, scale=scales.get(row.name))
+
+
+def results_bytes(n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False) -> int:
     """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
-    # The surface is made after what the albedo needs is free again.
-    more = max(_BYTES_OF_ALBEDO + n_lights if albedo else 0, BYTES_OF_SURFACE if surface else 0)
-    return n_pixels * (BYTES_OF_RESULTS + more)
+    # What one map needs is free again before the next is made.
+    each = [MAPS[name].bytes_per_pixel + MAPS[name].bytes_per_observation * n_lights for name in maps]
+    return n_pixels * (BYTES_OF_RESULTS + max([*each, BYTES_OF_SURFACE * surface]))

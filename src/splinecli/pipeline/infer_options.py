@@ -14,8 +14,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from msgspec import Meta
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS, check_not_empty, list_images
+from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
+from splinecli.capture.light_files import light_suffixes
 from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
@@ -25,7 +26,7 @@ from splinecli.errors import UsageError
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
-from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
+from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
 from splinecli.records import (
     FileName,
     NotNegative,
@@ -157,8 +158,8 @@ class Reading(Record, frozen=True, kw_only=True):
         "Folder with images of an evenly white surface: one for all lights, or one for each light.")] = None
     white_level: WhiteLevel = None
     lights: Annotated[FileName | None, Option("Lights", "FILE|estimate",
-        "Light directions: a line x y z for each image, z to the camera. estimate derives them from the images, with"
-        " lower accuracy.", default="the light file in CAPTURE")] = None
+        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate derives them from the"
+        " images, with lower accuracy.", default="the light file in CAPTURE")] = None
     first_light: Annotated[str | None, Option("Lights", "SIDE|DEGREES",
         "With --lights estimate: the side that the first light comes from, such as left, above or upper-left, or its"
         " azimuth, counter-clockwise from the right. Needed if the images show no outline of the object.",
@@ -456,6 +457,7 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     """The options of `info` beside those of Reading, as its help describes them."""
 
     capture: Annotated[Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")]
+    auto_mask: Annotated[bool, Option("Input", "", "If there is no mask, find the object in the images.")] = False
     check_lights: Annotated[bool, Option("Lights", "",
         "List other readings of the light file, and how well the images fit each.")] = False
     mended_lights: Annotated[Path | None, Option("Lights", "FILE",

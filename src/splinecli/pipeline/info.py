@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from splinecli.calibration.balls import find_view
+from splinecli.capture.formats.images import common_size
 from splinecli.capture.light_files import check_writable, encode_lights
 from splinecli.capture.record import FoundLights
 from splinecli.capture_warnings import estimated_lights
-from splinecli.diagnosis.checks import check_evidence
-from splinecli.diagnosis.evidence import Evidence
+from splinecli.diagnosis.capture_sample import CaptureSample
+from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
@@ -26,10 +27,7 @@ from splinecli.system.progress import SILENT, Observer
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net
-LEARNED_PER_SECOND = 1000  # of the sample of a distilled network, in the network and in learning
 DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
-SURFACE_PER_SECOND = 50_000  # integration, mesh and their files, on one core
-STARTING_SECONDS = 3
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -48,13 +46,14 @@ def describe_capture(
     plot: Path | None = None,
     overwrite: bool = False,
     check_lights: bool = False,
+    auto_mask: bool = False,
     mended_lights: Path | None = None,
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the mended lights, and return the report.
 
     Args:
         reading: how `infer` would read it. With its `strict`, what could not be checked is a warning, too.
-        plot, overwrite, check_lights, mended_lights: as in the help of `info`.
+        plot, overwrite, check_lights, auto_mask, mended_lights: as in the help of `info`.
 
     Raises:
         InputError: the folder has no capture, or a file cannot be read.
@@ -67,6 +66,10 @@ def describe_capture(
             raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
     with TemporaryDirectory() as frames:  # of a film
         source = reading.open(unpacked(capture, Path(frames), reading, observer, redo="all"))
+        common_size(source.facts)  # as infer
+        if auto_mask:
+            with observer.progress("finding the object", source.n_lights) as advance:
+                source = source.find_mask(lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
                 raise UsageError(
@@ -91,7 +94,9 @@ def describe_capture(
         check, warnings = None, summary.warnings()
         if summary.samples is not None:
             indices = range(source.n_lights)
-            check, found = check_evidence(Evidence.of_source(source, summary.samples, indices, strict=reading.strict))
+            check, found = check_sample(
+                CaptureSample.of_source(source, summary.samples, indices, strict=reading.strict)
+            )
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))
@@ -125,7 +130,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     if report["axis_angle_deg"] is not None:
         nearest, farthest = report["axis_angle_deg"]
         lights = report["light_directions"] or "estimated from the images"
-        lights += f", {nearest:.0f} to {farthest:.0f} degrees from the camera axis"
+        angles = f"{nearest:.0f} to {farthest:.0f}" if f"{nearest:.0f}" != f"{farthest:.0f}" else f"{nearest:.0f}"
+        lights += f", {angles} degrees from the camera axis"
     intensities = report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
     if estimated is not None and estimated["intensities"] is not None:
         intensities = "estimated from the images"
@@ -203,11 +209,11 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
-    first, seconds = summary.images[0], STARTING_SECONDS + _seconds(summary)
+    first, seconds = summary.images[0], 3 + _seconds(summary)
     view = find_view(source.facts[0], None)
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
-    if intensities is None and (source.light_intensities != 1).any():
+    if intensities is None and source.intensities_measured and (source.light_intensities != 1).any():
         intensities = files.light_directions  # the light files of AliceVision have both
     return {
         "capture": files.name,
@@ -232,7 +238,11 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "camera_matrix": None if source.camera_matrix is None else source.camera_matrix.tolist(),
         "exif_camera_matrix": view.matrix.round(1).tolist() if view.known else None,
         "light_intensities": None if intensities is None else str(intensities),
-        "mask": None if files.mask is None else str(files.mask),
+        "mask": "found in the images"
+        if source.automatic_mask is not None
+        else None
+        if files.mask is None
+        else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
         "axis_angle_deg": None
         if source.find_lights is not None and found is None
@@ -245,7 +255,8 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "expect": {
             "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
-            "seconds_with_surface": round(seconds + summary.n_pixels / SURFACE_PER_SECOND),
+            # 50,000 pixels a second: integration, mesh and their files on one core
+            "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
 
@@ -255,4 +266,5 @@ def _seconds(summary: CaptureSummary) -> float:
     count = summary.n_pixels
     if count < AUTOMATIC_FROM:
         return count / PIXELS_PER_SECOND
-    return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
+    # The network sees and learns 1000 pixels of the sample a second.
+    return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND

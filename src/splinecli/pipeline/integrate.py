@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import read_image, read_normal_map
-from splinecli.capture.files import ALBEDO_PICTURE, NORMALS, REPORT
 from splinecli.capture.formats.images import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
@@ -20,6 +19,7 @@ from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.documents import SurfaceFacts, Unit
 from splinecli.errors import InputError, SplinecliError
 from splinecli.maths.normals import Convention
+from splinecli.output_files import BYTES_OF_SURFACE, MAPS, NORMALS, REPORT
 from splinecli.pipeline.infer_options import check_pixel_size
 from splinecli.pipeline.options import IntegrateOptions
 from splinecli.results.files import UnfinishedError, read_report
@@ -39,8 +39,6 @@ from splinecli.system.files import check_free, read_json
 from splinecli.system.machine import import_extra
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
-
-BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
 
 
 def make_surface(
@@ -169,8 +167,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
     picture, colours = options.colours, None
-    if picture is None and (options.normals / ALBEDO_PICTURE).is_file():
-        picture = options.normals / ALBEDO_PICTURE
+    of_folder = options.normals / MAPS["albedo"].files["png"]
+    if picture is None and of_folder.is_file():
+        picture = of_folder
     if picture is not None:
         image = np.broadcast_to(read_image(picture, ExpectedSize(mask.shape, "the normal map")), (*mask.shape, 3))
         colours = np.rint(255 * image.clip(0, 1)).astype(np.uint8)

@@ -15,7 +15,7 @@ from splinecli.errors import UsageError
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
+from splinecli.methods import DEFAULT_METHOD, METHODS, MethodOptions, check_method, method_names
 from splinecli.pipeline.infer_options import (
     CURVES,
     DISCONTINUITY_HELP,
@@ -46,6 +46,7 @@ from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURF
 from splinecli.training import defaults
 
 DEFAULT_TRIALS = 100
+TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
 DEFAULT_LIGHTS = 10
 _MOST_DIGITS = 18  # of a number of images
 
@@ -211,7 +212,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         "Number of lights in each draw. May be repeated.", default=str(DEFAULT_LIGHTS), parse=parse_light_count,
         repeated=True)] = ()
     trials: Annotated[Count | None, Option("Lights", "T", "Number of random draws.",
-        default=str(DEFAULT_TRIALS))] = None
+        default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} of four methods or more")] = None
     seed: RandomSeed = 0
     draws: Annotated[FileName | None, Option("Lights", "FILE",
         "Draws of lights: each line has light indices, counted from 0.")] = None
@@ -270,7 +271,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
             )
         for name in self.names:
             check_method(name)
-        if self.pixels and not (self.figures and any(name.startswith("spline-net") for name in self.names)):
+        if self.pixels and not (self.figures and any(METHODS[name].observation_maps for name in self.names)):
             raise UsageError(
                 "--pixel chooses the observation maps that --figures shows",
                 hint="Add --figures and --method spline-net",
@@ -292,11 +293,12 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         """One protocol for each number of lights and each light noise. Raises UsageError."""
         from splinecli.lights.light_fit import LIGHT_ERROR_DEG
 
+        usual = TRIALS_OF_MANY if len(self.names) >= MANY_METHODS else DEFAULT_TRIALS
         counts = self.n_lights or ((DEFAULT_LIGHTS,) if self.draws is None else (None,))
         return [
             Protocol(
                 count,
-                DEFAULT_TRIALS if self.trials is None else self.trials,
+                usual if self.trials is None else self.trials,
                 self.seed,
                 None if self.draws is None else Path(self.draws),
                 noise,

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture import find_captures
-from splinecli.capture.files import CONTACT_SHEET
 from splinecli.errors import InputError, UsageError
+from splinecli.output_files import CONTACT_SHEET
 from splinecli.pictures.maps import contact_sheet, encode_png
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.infer_options import ClusterOptions
@@ -21,8 +21,7 @@ from splinecli.pixel_sets.entries import (
     name_captures,
     save_rendered,
 )
-from splinecli.pixel_sets.store import MANIFEST, PixelSet
-from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pixel_sets.store import MANIFEST, PixelSet, PixelSetWriter
 from splinecli.synthesis.scenes import SceneConfig
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
 from splinecli.system.progress import SILENT, Advance, Observer

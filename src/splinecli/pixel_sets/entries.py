@@ -14,12 +14,10 @@ from splinecli.capture import capture_name, open_capture
 from splinecli.capture.files import digest
 from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
-from splinecli.pixel_sets.store import ARRAYS, Pixels
-from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pixel_sets.store import ARRAYS, Pixels, PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
-from splinecli.synthesis.relief import read_relief
 from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
-from splinecli.synthesis.shapes import draw_view
+from splinecli.synthesis.shapes import draw_view, read_relief
 from splinecli.system.files import file_sha256, free_name, replacing
 from splinecli.system.machine import import_extra
 

@@ -32,6 +32,9 @@ _SQUARES, _SIDE = 16, 128  # of a capture that has more pixels, only so many squ
 _STEEP_SHARE = 0.01  # share of the local maxima of the gradient that count as edges
 _FEWEST_EDGES = 60
 _CORRELATION_ERROR = 0.1
+_SMOOTHEST = 0.5
+"""Correlation of gradients at a distance of three pixels above which the images show shading alone, and no edge. No
+blur of up to WIDEST_SIGMA reaches it."""
 _THREADS = 2
 
 # benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and the coefficients of
@@ -70,7 +73,7 @@ def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | No
 
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
     numbers = edge_numbers(observations, mask, around)
-    if numbers is None:
+    if numbers is None or numbers[-1] > _SMOOTHEST:
         return None
     terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
     sigma = min(float(terms @ np.array(_COEFFICIENTS)), _widest_at(numbers[2]), WIDEST_SIGMA)

@@ -1,68 +1,38 @@
-"""What `infer` leaves for a capture: its albedo, its report, and the files of its maps, of which all are written or
-none."""
+"""What `infer` leaves for a capture: its report, and its files, of which all are written or none."""
 
 from __future__ import annotations
 
 import io
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import convert
-from numpy.typing import NDArray
 
 from splinecli import __version__
-from splinecli.capture import Capture, CaptureSource
-from splinecli.capture.files import (
-    ALBEDO,
-    ALBEDO_EXR,
-    ALBEDO_PICTURE,
-    CONFIDENCE,
-    CONFIDENCE_PICTURE,
-    CURVATURE,
-    CURVATURE_PICTURE,
-    CURVATURE_TIFF,
+from splinecli.capture import Capture
+from splinecli.capture.light_files import rows_text
+from splinecli.capture.record import name_reading
+from splinecli.documents import Distillation, EstimateReport, NearLampsReport, UsedWeights, WarningReport
+from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
+from splinecli.output_files import (
     ERROR_MAP,
     FOUND_DIRECTIONS,
     FOUND_INTENSITIES,
     FOUND_LIGHTS,
     FOUND_MASK,
-    GRADIENT,
-    GRADIENT_TIFF,
     LIGHT_PLOT,
     NORMALS,
-    OWN_FILES,
-    PREVIEW,
-    RELIEF,
-    RELIEF_PICTURE,
-    RELIEF_TIFF,
     REPORT,
+    own_files,
 )
-from splinecli.capture.light_files import rows_text
-from splinecli.capture.linearise import StoredPixels, take_pixels
-from splinecli.capture.record import name_reading
-from splinecli.documents import Distillation, EstimateReport, NearLampsReport, UsedWeights, WarningReport
-from splinecli.maths.normals import (
-    AngularErrors,
-    Convention,
-    curvature_of_normals,
-    describe,
-    encode_picture,
-    gradient_of_normals,
-)
-from splinecli.pictures.maps import (
-    albedo_picture,
-    confidence_picture,
-    encode_png,
-    error_map_picture,
-    preview_picture,
-    signed_picture,
-)
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, encode_tiff, file_names
+from splinecli.pictures.maps import encode_png
+from splinecli.pictures.plots import error_map_picture
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
@@ -70,80 +40,6 @@ if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
     from splinecli.system.progress import Clock
-
-
-LIT = 0.15  # a light counts for a pixel if n.l is above this
-AGREEING = 0.3  # an observation counts within this share of the median albedo: no highlights, no cast shadows
-RESTORED_WEIGHT = 1e-3  # of a restored observation, whose colour is saturated: the others decide
-_TILE_PIXELS = 65_536
-
-
-def albedo_map(
-    source: CaptureSource,
-    capture: Capture,
-    normal_map: NDArray[np.float32],
-    progress: Callable[[], object] = lambda: None,
-) -> NDArray[np.float32]:
-    """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
-
-    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
-    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known up
-    to one factor for the whole capture unless the intensities are absolute.
-
-    The images of the source are read again, one at a time, for their colours; `progress` is called after each. The
-    capture is what the source read; under near lamps, with the points of its surface. The normal map (H, W, 3) is unit
-    in its mask. Raises InputError if an image can no longer be read.
-    """
-    normals = take_pixels(normal_map, capture.mask)
-    counts = np.empty(capture.observations.shape, np.bool_)
-    for start in range(0, len(normals), _TILE_PIXELS):
-        tile = slice(start, start + _TILE_PIXELS)
-        cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
-        counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
-    total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
-    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
-    for position, colours in enumerate(images):
-        cosines, strengths = _shading(capture, normals, slice(None), [position])
-        cosine = cosines[:, 0] * counts[:, position]
-        colours /= strengths
-        if capture.estimated_colours is not None:
-            colours /= capture.estimated_colours[position].astype(np.float32)
-        if capture.estimated_intensities is not None:
-            colours /= np.float32(capture.estimated_intensities[position])
-        weight = cosine
-        if capture.restored is not None:
-            weight = cosine * np.where(capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1))
-        colours *= weight[:, None]  # in place, because large captures need the memory
-        total += colours
-        squares += weight * cosine
-        del colours
-    albedo = np.zeros((*capture.mask.shape, 3), np.float32)
-    albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
-    return albedo
-
-
-def _shading(
-    capture: Capture, normals: NDArray[np.float32], rows: slice, positions: Sequence[int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) of some pixels under K lights, and the strengths of these: (p, K), or (1, 1) if distant."""
-    if capture.lamps is None:
-        lights = capture.light_directions[list(positions)].astype(np.float32)
-        return normals[rows] @ lights.T, np.ones((1, 1), np.float32)
-    assert capture.lamps.points is not None
-    directions, strengths = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[rows])
-    return np.einsum("pfc,pc->pf", directions, normals[rows]), strengths
-
-
-def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
-    lit = cosine > LIT
-    albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
-    # The median of the lit observations, which sorting moves to the front.
-    ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
-    middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
-    with np.errstate(invalid="ignore"):
-        close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= AGREEING * middle)
-    return close
 
 
 def report_of(
@@ -219,11 +115,11 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
 
-    The files, of OWN_FILES and FOUND_LIGHTS, replace those of an earlier run in the folder (see new_files), which the
+    The files, of own_files() and FOUND_LIGHTS, replace those of an earlier run in the folder (see new_files), which the
     caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
-    stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
+    stale = [name for name in own_files() if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
             new.write(name, content)
@@ -311,45 +207,3 @@ def light_files(capture: Capture, plot: bytes) -> Files:
     if capture.estimated_intensities is not None:
         yield FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
     yield LIGHT_PLOT, plot
-
-
-def albedo_files(albedo: NDArray[np.float32], mask: NDArray[np.bool_], *, exr: bool) -> Files:
-    """Yield a linear albedo map (H, W, 3) as a float32 NPY file, as a picture and, with exr, as a float16 EXR file."""
-    yield ALBEDO, albedo
-    if exr:
-        largest = np.finfo(np.float16).max
-        yield ALBEDO_EXR, encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})
-    yield ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask))
-
-
-def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: float, *, tiff: bool) -> Files:
-    """Yield those of the maps that follow from the normals alone: float32 NPY and TIFF files, and pictures."""
-    normal_map, mask = estimate.normal_map, estimate.capture.mask
-    if "confidence" in maps and estimate.confidence_map is not None:
-        yield CONFIDENCE, estimate.confidence_map
-        yield CONFIDENCE_PICTURE, encode_png(confidence_picture(estimate.confidence_map))
-    if "preview" in maps:
-        yield PREVIEW, encode_png(preview_picture(normal_map, mask))
-    if "gradient" in maps:
-        gradient = gradient_of_normals(normal_map, mask)
-        yield from _value_files((GRADIENT, GRADIENT_TIFF), gradient, "slopes dz/dx and dz/dy, x right, y up", tiff=tiff)
-    if "curvature" in maps:
-        curvature = curvature_of_normals(normal_map, mask)
-        words = f"mean curvature, black {-curvature_scale}, gray 0, white {curvature_scale} per pixel"
-        units = "mean and Gaussian curvature, 1/pixel and 1/pixel^2"
-        yield from _value_files((CURVATURE, CURVATURE_TIFF), curvature, units, tiff=tiff)
-        yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], curvature_scale), {"curvature": words})
-
-
-def relief_files(relief: NDArray[np.float32], scale: float, *, tiff: bool) -> Files:
-    """Yield a relief (H, W) as a float32 NPY file, with tiff as a TIFF file, too, and as a gray picture."""
-    words = f"height, black {-scale}, gray 0, white {scale} pixels"
-    yield from _value_files((RELIEF, RELIEF_TIFF), relief, "heights in pixels", tiff=tiff)
-    yield RELIEF_PICTURE, encode_png(signed_picture(relief, scale), {"relief": words})
-
-
-def _value_files(names: tuple[str, str], values: NDArray[np.float32], description: str, *, tiff: bool) -> Files:
-    """Yield a map (H, W) or (H, W, C) as a float32 NPY file and, with tiff, as a TIFF file with a description."""
-    yield names[0], values
-    if tiff:
-        yield names[1], encode_tiff(values, description)

@@ -13,22 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli import __version__
-from splinecli.capture.files import NORMALS, PAGE, REPORT
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
-from splinecli.pictures.maps import (
-    PREVIEW_LIGHT,
-    TICKS,
-    TOP_DEG,
-    Picture,
-    albedo_picture,
-    colour_errors,
-    confidence_picture,
-    encode_png,
-)
+from splinecli.output_files import MAPS, NORMALS, PAGE, REPORT
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, Picture, colour_errors, encode_png
 from splinecli.results.files import read_report
+from splinecli.results.maps import map_picture
 from splinecli.system.machine import is_out_of_memory
 
 
@@ -66,8 +58,7 @@ def result_page(
     normal_map: NDArray[np.float32],
     mask: NDArray[np.bool_],
     *,
-    albedo: NDArray[np.float32] | None = None,
-    confidence_map: NDArray[np.float32] | None = None,
+    values: Mapping[str, NDArray[np.float32]] | None = None,
     error_map_deg: NDArray[np.float32] | None = None,
     light_plot: bytes | None = None,
 ) -> str:
@@ -83,19 +74,17 @@ def result_page(
             the page are in millimetres if its surface is, else in pixels of the whole maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
-        albedo: (H, W, 3), linear, from albedo_map.
-        confidence_map: (H, W), probabilities.
+        values: (H, W) or (H, W, C), by name, of the maps of MAPS that the page shows.
         error_map_deg: (H, W) degrees, NaN where there is no error.
         light_plot: a PNG of the lights, where they were found from the images.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
+    values = values or {}
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
     error_png = None
-    if albedo is not None:
-        maps["albedo"] = albedo_picture(_reduce(albedo, mask, LARGEST_MAP)[0], shown)
-    if confidence_map is not None:
-        reduced = _reduce(confidence_map[..., None], mask, LARGEST_MAP)[0][..., 0]
-        maps["confidence"] = confidence_picture(reduced)
+    for name, whole in values.items():
+        reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(*shown.shape, *whole.shape[2:])
+        maps[name] = map_picture(MAPS[name], reduced, shown)
     if error_map_deg is not None:
         errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
         error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan)))
@@ -131,6 +120,7 @@ def result_page(
         largest_code=_LARGEST_CODE,
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
+        captions={name: MAPS[name].caption for name in values},
         error_map=error_png,
         light_plot=None if light_plot is None else picture_url(light_plot),
         error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
@@ -201,7 +191,10 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
         ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
         *([] if reduced is None else [("Size on this page", reduced)]),
-        ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:g}" for name, n in seconds if n and name != "total")),
+        (
+            "Seconds",
+            ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in seconds if n >= 0.05 and name != "total"),
+        ),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
 
@@ -213,9 +206,7 @@ def _data_url(picture: Picture) -> str:
 INDEX = "index.html"
 
 THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
-_LARGEST_SHOWN = 10**9  # bytes of a normal map shown small: 33 megapixels of 16 bits; others may be bombs
 _OURS = b'<meta name="generator" content="splinecli">'
-_START = 1 << 16  # bytes of a page, which contain this mark
 
 
 class Row(NamedTuple):
@@ -284,7 +275,8 @@ def _thumbnail(path: Path) -> str | None:
     import cv2
 
     try:
-        if image_bytes(*read_facts(path).size) > _LARGEST_SHOWN:
+        # 33 megapixels of 16 bits; larger ones may be bombs.
+        if image_bytes(*read_facts(path).size) > 10**9:
             return None
         picture = decode_image(path)
     except InputError:
@@ -323,7 +315,7 @@ def has_index(folder: Path) -> bool:
         if not (folder / INDEX).is_file():
             return False
         with (folder / INDEX).open("rb") as file:
-            return _OURS in file.read(_START)
+            return _OURS in file.read(1 << 16)  # the mark is near the top
     except OSError:
         return False
 

@@ -112,7 +112,6 @@ def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
 # Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that no
 # equation ties to others keep their heights, and the system is never singular.
 _DAMPING_OF_GAPS = 1e-7
-_STEPS_BEFORE_RENEWAL = 15  # above this number of steps, a new preconditioner saves more time than it costs
 
 
 class LaplacianSolver:
@@ -170,7 +169,7 @@ class LaplacianSolver:
             M=self._preconditioner,
             callback=lambda _: next(steps),
         )
-        if next(steps) > _STEPS_BEFORE_RENEWAL:
+        if next(steps) > 15:  # above this number of steps, a new preconditioner saves more time than it costs
             self._preconditioner = None
         return change
 

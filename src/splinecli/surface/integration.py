@@ -25,16 +25,10 @@ _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and ref
 _FIRST_PRECISION, _LATER_PRECISION = 1e-9, 0.03  # relative residuals of the linear solves
 _STILL = 0.002  # pixels: the rms movement at which the surface is finished
 _COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
-_FINEST = 8_000_000  # pixels; larger maps have the heights of their blocks, interpolated
 _SOLVES_OF_COARSEST = 150
-_MOST_SOLVES, _FEWEST_SOLVES = 20, 4  # the most at finer scales, of small maps and of large ones
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
-_PRIOR_DETAIL = 0.15  # of the root of the mask's area
-_CORRELATED = 0.3  # slopes of prior and normals
-_LEAST_STEEP, _MOST_STEEP = 0.2, 5.0  # times the normals' slopes; a blurred prior is flatter
 _LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; float32 keeps no more than whole numbers above
 _FARTHEST = 3.0  # from the median height to any other, in the larger of the mask's width and height
-_MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
 RELIEF_WIDTH = 64.0
 """Waves of this width in pixels keep half of their height; the normals' small errors over wider ones do not count."""
@@ -83,7 +77,8 @@ def integrate_normals(
     known = None
     if prior is not None:
         known = _heights_of_prior(prior, mask, camera_matrix)
-        prior_detail = _PRIOR_DETAIL * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
+        # By default, 0.15 times the root of the mask's area
+        prior_detail = 0.15 * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
         if not (isfinite(prior_detail) and prior_detail > 0):
             raise UsageError(f"the detail of the prior is {prior_detail:g} pixels, expected a positive number")
     surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
@@ -141,7 +136,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
-    is_huge = n_pixels > _FINEST
+    is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
     if is_huge or (n_pixels > _COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
@@ -150,7 +145,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights
-        precision, most = _LATER_PRECISION, min(_MOST_SOLVES, max(_FEWEST_SOLVES, _SOLVED_PIXELS // n_pixels))
+        precision, most = _LATER_PRECISION, min(20, max(4, _SOLVED_PIXELS // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
     # Normals fix gaps, which are the smaller the wider a wave is. At this width, both weigh the same.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
@@ -182,7 +177,8 @@ def _normals_of(blocks: Blocks, normals: Doubles, mask: Bools, *, keep_edges: bo
     by_steepness = np.lexsort((normals[:, 2], block))
     first = np.searchsorted(block[by_steepness], np.arange(len(mean)))
     steepest = normals[by_steepness[first]]
-    mixed = (closest < np.cos(np.radians(_MIXED_DEG))) & (steepest[:, 2] > SMALLEST_COSINE)
+    # A block that contains an edge has a normal so far from their mean.
+    mixed = (closest < np.cos(np.radians(20.0))) & (steepest[:, 2] > SMALLEST_COSINE)
     return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
@@ -226,7 +222,8 @@ def _check_prior(surface: _Surface) -> None:
     both = float(found @ wanted)
     correlation = both / max(float(np.linalg.norm(found) * np.linalg.norm(wanted)), 1e-12)
     steeper = both / max(float(wanted @ wanted), 1e-12)
-    if abs(correlation) > _CORRELATED and not _LEAST_STEEP < steeper < _MOST_STEEP:
+    # A blurred prior is flatter than the normals.
+    if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
         raise InputError(
             f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
             hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",

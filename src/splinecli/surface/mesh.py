@@ -175,7 +175,6 @@ TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
 LARGE_MAP = 500_000  # pixels from which the triangles of a map are so many that those of blocks are decimated
 _TRIANGLES = 50_000  # at a time
 _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
-_FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
 _LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 
 
@@ -346,7 +345,7 @@ def _barycentric_forms(corners: Doubles) -> Doubles:
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
     area = np.einsum("tcx,tcx->tc", normal, corners - following)
-    area[np.abs(area) < _FLATTEST] = np.nan  # a triangle that covers nothing
+    area[np.abs(area) < 1e-9] = np.nan  # a triangle that the camera sees from the side covers nothing
     normal = normal / area[..., None]
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 

@@ -41,7 +41,6 @@ DEPTH_FORMATS = ("npy", "tiff", "png")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
 GRAY = 204  # colour of a mesh without a texture, of 255
 _WHITE = 65535  # of 16 bits
-_FLOAT = 5126  # of glTF
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,7 @@ def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
             part["attributes"]["TANGENT"] = len(tree["accessors"])
         tree["accessors"]["tangents"] = {
             "bufferView": len(buffers),
-            "componentType": _FLOAT,
+            "componentType": 5126,  # of glTF
             "type": "VEC4",
             "count": len(tangents),
         }

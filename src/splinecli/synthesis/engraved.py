@@ -13,8 +13,6 @@ from torch import Tensor
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.random_numbers import draw_number
 
-_SMOOTH_SHARE = 1 / 3  # a share of the pieces has no detail: smooth things must stay smooth, whatever they are made of
-
 
 def draw_engraved(
     size: int, lights: Tensor, generator: torch.Generator, *, round_share: float = 1 / 3
@@ -30,7 +28,8 @@ def draw_engraved(
     """
     uniform = partial(draw_number, generator)
     normals, mask = _draw_base(size, round_share, generator)
-    if uniform() >= _SMOOTH_SHARE:
+    # A third of the pieces has no detail: smooth things must stay smooth, whatever they are made of.
+    if uniform() >= 1 / 3:
         detail = _draw_detail(size, generator)
         normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
         normals = torch.nn.functional.normalize(normals, dim=1)

@@ -21,9 +21,6 @@ def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: t
     return (largest * (1 - 0.2 * draw_uniform(generator, pixels))).round().long().clamp(low, high)
 
 
-_LEAST_CONE_DEG, _MOST_CONE_DEG = 20, 90
-
-
 def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Choose `count` of the light directions (F, 3) at random, within a cone about the view axis; return their indices.
 
@@ -36,7 +33,7 @@ def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -
 def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
     """Return ranks (P, F) of the lights (P, F, 3) of P pixels, whose lowest are chosen; see choose_in_cone."""
     uniform = draw_uniform(generator, *directions.shape[:2])
-    half_angle = _uniform_deg(generator, len(directions), 1, low=_LEAST_CONE_DEG, high=_MOST_CONE_DEG)
+    half_angle = _uniform_deg(generator, len(directions), 1, low=20, high=90)
     z = directions[..., 2]
     # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
     return torch.where(z >= half_angle.cos(), uniform, 2 - z)

@@ -1,7 +1,14 @@
-"""Triangle meshes in the frame of the camera: x right, y up, z to the camera. It sees the square [-1, 1]^2."""
+"""Triangle meshes in the frame of the camera: x right, y up, z to the camera. It sees the square [-1, 1]^2.
+
+They are read from files, or are surfaces of approximate signed distance fields. A field is a function of points (N, 3).
+It is negative inside the shape and grows at about unit rate across its surface. Smooth union: Quilez, "Smooth minimum"
+(https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et al. 2003); the vertices are then moved onto
+the zero of the field, and its gradient gives their normals.
+"""
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +18,7 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 from splinecli.system.files import check_file
-from splinecli.system.machine import is_out_of_memory
+from splinecli.system.machine import import_extra, is_out_of_memory
 
 Floats = NDArray[np.floating]
 REACH = 0.94  # half-width of the object in the camera's square
@@ -129,3 +136,166 @@ def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = MOST_FACES
         faces = np.concatenate((faces[~long], *(np.stack(quarter, axis=1) for quarter in quarters)))
     normals = unit(corners[:, 3:]).astype(np.float32)
     return Mesh(corners[:, :3].astype(np.float32), faces.astype(np.int32), normals)
+
+
+Field = Callable[[Floats], Floats]
+
+
+def ellipsoid(half_axes: Floats) -> Field:
+    """Return an ellipsoid around the origin. The distance is exact on the surface, and everywhere for a sphere."""
+
+    def distance(points: Floats) -> Floats:
+        scaled = np.linalg.norm(points / half_axes, axis=1)
+        slope = np.linalg.norm(points / half_axes**2, axis=1)
+        return np.asarray(scaled * (scaled - 1) / np.maximum(slope, 1e-6))
+
+    return distance
+
+
+def box(half_widths: Floats, rounding: float) -> Field:
+    """Return a box around the origin with rounded edges."""
+
+    def distance(points: Floats) -> Floats:
+        beyond = np.abs(points) - (half_widths - np.float32(rounding))
+        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0) - np.float32(rounding))
+
+    return distance
+
+
+def torus(radius: float, tube: float) -> Field:
+    """Return a ring around the z axis."""
+
+    def distance(points: Floats) -> Floats:
+        ring = np.hypot(points[:, 0], points[:, 1]) - np.float32(radius)
+        return np.hypot(ring, points[:, 2]) - np.float32(tube)
+
+    return distance
+
+
+def capsule(half_length: float, radius: float) -> Field:
+    """Return a rod along z with round ends."""
+
+    def distance(points: Floats) -> Floats:
+        along = points[:, 2] - np.clip(points[:, 2], -np.float32(half_length), np.float32(half_length))
+        return np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + along**2) - np.float32(radius)
+
+    return distance
+
+
+def moved(field: Field, rotation: Floats, centre: Floats) -> Field:
+    """Return the shape, rotated by a matrix and then moved to a centre."""
+    return lambda points: field((points - centre) @ rotation)
+
+
+def smooth_union(first: Floats, second: Floats, blend: float) -> Floats:
+    """Return the distance to the union of two shapes, with a fillet of width `blend` along the seam."""
+    overlap = np.maximum(blend - np.abs(first - second), 0) / blend
+    return np.minimum(first, second) - overlap * overlap * np.float32(blend / 4)
+
+
+def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
+    """Return the distance to a shape after another one was cut out of it."""
+    return -smooth_union(-shape, tool, blend)
+
+
+def waves(rng: np.random.Generator, frequency: float, outputs: int = 1) -> Field:
+    """Draw a smooth random function (N, outputs) of about unit variance: plane waves of random directions.
+
+    The wave numbers are U(0.6, 1.4) * frequency, in cycles per unit length. A single output has shape (N,).
+    """
+    count = 10
+    directions = rng.normal(size=(3, count))
+    directions *= 2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
+    phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
+    mixing = rng.normal(size=(count, outputs)) * np.sqrt(2 / count)
+    matrix, mixing = directions.astype(np.float32), mixing.astype(np.float32)
+
+    def value(points: Floats) -> Floats:
+        mixed = np.sin(points @ matrix + phases) @ mixing
+        return np.asarray(mixed[:, 0] if outputs == 1 else mixed)
+
+    return value
+
+
+def ridges(rng: np.random.Generator, frequency: float) -> Field:
+    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| of two octaves, one half as high."""
+    low, high = waves(rng, frequency), waves(rng, 2 * frequency)
+
+    def value(points: Floats) -> Floats:
+        total = (1 - 2 * np.abs(low(points))) + 0.5 * (1 - 2 * np.abs(high(points)))
+        return np.asarray(total / 1.5, dtype=np.float32)
+
+    return value
+
+
+def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
+    """Return the gradient (N, 3) by central differences."""
+    axes = np.eye(3, dtype=np.float32) * np.float32(step)
+    return np.stack([(field(points + a) - field(points - a)) / np.float32(2 * step) for a in axes], axis=1)
+
+
+def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: float) -> Mesh | None:
+    """Return the surface of a field inside a box around the origin, sampled every `spacing`; None if it is empty.
+
+    Only the largest connected part is kept.
+    """
+    counts = [int(np.ceil(2 * half / spacing / COARSE)) * COARSE + 1 for half in half_widths]
+    axes = [((np.arange(count) - (count - 1) / 2) * spacing).astype(np.float32) for count in counts]
+    values = _sample(field, axes, spacing)
+    if not values.min() < 0 < values.max():
+        return None
+    measure = import_extra("skimage.measure", "render")
+    # The corners of a face run anticlockwise as seen from where the values are above 0, which is outside.
+    found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
+    vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
+    vertices, faces = _largest_part(vertices, faces)
+    # Make one step of Newton's method, because linear interpolation between samples leaves terraces.
+    slope = gradient(field, vertices)
+    squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
+    move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
+    vertices = vertices - move[:, None] * slope
+    normals = unit(gradient(field, vertices))
+    return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
+
+
+COARSE = 4  # Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely.
+
+
+def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
+    """Sample the field on the grid of three axes: exactly near its surface, with the right sign elsewhere."""
+    coarse = _evaluate(field, *np.meshgrid(*(axis[::COARSE] for axis in axes), indexing="ij"))
+    # Fields grow at rates up to about 2. The centre of a cell is half its diagonal away from its corners.
+    reach = 2 * COARSE * spacing * np.sqrt(3) / 2
+    near = np.abs(coarse) < reach
+    close = np.zeros([size - 1 for size in coarse.shape], dtype=bool)
+    for x, y, z in np.ndindex(2, 2, 2):
+        close |= near[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]]
+    far = coarse
+    for axis in range(3):
+        close, far = np.repeat(close, COARSE, axis), np.repeat(far, COARSE, axis)
+    shape = tuple(len(axis) for axis in axes)
+    values = np.ascontiguousarray(far[: shape[0], : shape[1], : shape[2]])
+    exact = np.zeros(shape, dtype=bool)
+    # The upper faces of a cell belong to it, too.
+    for x, y, z in np.ndindex(2, 2, 2):
+        exact[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]] |= close
+    at = exact.nonzero()
+    values[at] = _evaluate(field, *(axis[index] for axis, index in zip(axes, at, strict=True)))
+    return values
+
+
+def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
+    points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
+    # Evaluate pieces that fit into the processor's cache.
+    pieces = [field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)]
+    return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
+
+
+def _largest_part(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, NDArray[np.int32]]:
+    from trimesh.graph import connected_component_labels
+
+    part = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices))
+    kept = part == np.bincount(part).argmax()
+    row = np.cumsum(kept) - 1
+    return vertices[kept], row[faces[kept[faces[:, 0]]]].astype(np.int32)

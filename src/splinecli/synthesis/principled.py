@@ -23,9 +23,6 @@ _SHINY, _METAL, _HALF_METAL = 0.30, 0.58, 0.86
 CLASSES = {"diffuse": (0.0, _SHINY), "specular": (_SHINY, _METAL), "metallic": (_METAL, 1.0)}
 """Classes of materials of the rendered scenes, and the range of the number that selects the kind."""
 
-_RETRO_EXPONENT = 20
-"""The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart."""
-
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
@@ -78,7 +75,9 @@ class PrincipledMaterial:
         if bool((self.minnaert != 1).any()):
             diffuse = diffuse * _power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
         if bool((self.retro > 0).any()):
-            diffuse = diffuse + self.retro * l_dot_h ** (2 * _RETRO_EXPONENT)
+            # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees
+            # apart.
+            diffuse = diffuse + self.retro * l_dot_h ** (2 * 20)
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
         f0 = (0.08 * self.specular * (1 - self.metallic) + self.base * self.metallic).clamp(max=1)

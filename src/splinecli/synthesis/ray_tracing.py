@@ -127,9 +127,6 @@ def _packed(vectors: Floats) -> Floats:
     return np.ascontiguousarray(vectors, dtype=np.float32)
 
 
-MIN_NORMAL_Z = 0.05  # pixels that are seen at a more grazing angle are left out
-
-
 @dataclass(frozen=True)
 class VisibleSurface:
     """The surface points that the camera sees in P pixels, with S samples each."""
@@ -176,7 +173,7 @@ def find_visible_surface(
     first = np.cumsum(found) - found  # row of the first sample of each pixel
     rows = first[seen, None] + np.arange(per_pixel) % found[seen, None]
     normals = unit(hits.normal[rows].mean(axis=1))
-    kept = normals[:, 2] > MIN_NORMAL_Z
+    kept = normals[:, 2] > 0.05  # pixels that are seen at a more grazing angle are left out
     coverage = (found[seen] / per_pixel).astype(np.float32)
     seen[seen] = kept
     mask = seen.reshape(size, size)

@@ -28,9 +28,6 @@ from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer, VisibleSurface
 
 SOFTEST = 0.3  # lowest roughness of surfaces that light other surfaces
-MOST_WEIGHT = 8.0
-MOST_RADIANCE = 8.0
-"""Limits on the contribution of one path, relative to its expected share. Larger values are only noise."""
 
 SHADED_ROWS = 512
 """Number of points that are shaded together. A tensor then has about a megabyte and stays in the cache."""
@@ -174,7 +171,7 @@ def _extend(
     for name, material in materials.items():
         reflected = material.take(met.patches).shade(cosines[0], cosines[1], w_dot_v)
         share = reflected / (np.pi * density[rows].clamp(min=1e-6))
-        onward[name] = weights[name][rows] * share.clamp(max=MOST_WEIGHT)
+        onward[name] = weights[name][rows] * share.clamp(max=8.0)
     patches = torch.from_numpy(patch_of_face[hits.triangle])
     return _Vertices(hits, -direction[rows], met.pixel, patches), onward
 
@@ -203,7 +200,8 @@ def _gather(
             shaded = material.take(vertices.patches[some]).shade(cosines, n_dot_v, l_dot_v)
             spread = torch.zeros(len(pixels), len(place))
             spread[place, torch.arange(len(place))] = weights[name][some, 0]
-            radiance[name][pixels] += spread @ shaded.clamp(max=MOST_RADIANCE)
+            # Limits on the contribution of one path, relative to its expected share. Larger values are only noise.
+            radiance[name][pixels] += spread @ shaded.clamp(max=8.0)
 
 
 def _thin_out(

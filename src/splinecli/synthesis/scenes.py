@@ -17,9 +17,8 @@ from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.relief import Relief, draw_relief, read_relief
 from splinecli.synthesis.rendering import render_direct, render_indirect
-from splinecli.synthesis.shapes import draw_shape
+from splinecli.synthesis.shapes import Relief, draw_detail, draw_shape, read_relief
 
 MATERIALS = {f"{name}{suffix}": kinds for suffix in ("", "-2", "-3") for name, kinds in CLASSES.items()}
 """The sets of materials of a scene, and for each the range of the number that selects the kind; see draw_material."""
@@ -66,7 +65,7 @@ def draw_scene(
 ) -> Scene:
     """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
 
-    Half of the scenes have the relief of one of the normal maps, if any are given; see draw_relief.
+    Half of the scenes have the relief of one of the normal maps, if any are given; see draw_detail.
 
     The surface has one patch in 60 % of the scenes, as real objects have one material or few, 2 to 12 in 25 %, and 20
     to 3,000 in 15 %. In half of the scenes the patches differ in their base alone, as on a painted or printed object of
@@ -91,7 +90,7 @@ def draw_scene(
     own = np.random.default_rng([seed, index, 1])
     relief = None
     if reliefs and own.random() < 0.5:
-        relief = draw_relief(read_relief(reliefs[int(own.integers(len(reliefs)))]), config.size, own)
+        relief = draw_detail(read_relief(reliefs[int(own.integers(len(reliefs)))]), config.size, own)
     return Scene(shape, mesh, lights, materials, patch_of_face, render_seed, relief)
 
 

@@ -1,17 +1,25 @@
-"""Random shapes with folds, hollows and occlusions as sculptures have, made of signed distance fields.
+"""Random shapes with folds, hollows and occlusions as sculptures have, and the relief on their surface.
 
-Unions of round blobs alone would be too convex: they have few cast shadows and few interreflections.
+Shapes are made of signed distance fields. Unions of round blobs alone would be too convex: they have few cast shadows
+and few interreflections. Relief is a tileable normal map that turns the visible normals, because meshes are smooth from
+one pixel to the next. Stone, cloth and leather are not, and networks that were trained without such detail smooth it
+away. Shadows stay those of the mesh.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from splinecli.synthesis import fields
+from splinecli.capture.formats.images import read_image
+from splinecli.errors import InputError
+from splinecli.maths.normals import unit
+from splinecli.synthesis import meshes
 from splinecli.synthesis.meshes import LONGEST_EDGE, Floats, Mesh, fit_to_frame, read_mesh, split_long_edges
 
 SPACING = 0.0125
@@ -54,9 +62,6 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
 
 
-_CLOSEST = 2.2  # largest factor by which a view is enlarged
-
-
 def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> Mesh:
     """Draw a view of a mesh, which is in the frame.
 
@@ -69,7 +74,8 @@ def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> M
         mesh = _touching(mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng)
     mesh = fit_to_frame(mesh)
     if rng.random() < 0.5:
-        enlarged, middle = rng.uniform(1, _CLOSEST), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
+        # A view is enlarged by up to this factor.
+        enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
         shift = np.append(middle * (1 - enlarged), 0)
         mesh = Mesh((mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals)
     return split_long_edges(mesh, longest=LONGEST_EDGE)
@@ -89,21 +95,21 @@ def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
     )
 
 
-def _draw_solid(rng: np.random.Generator, size: float) -> fields.Field:
+def _draw_solid(rng: np.random.Generator, size: float) -> meshes.Field:
     kind = rng.integers(4)
     if kind == 0:
-        return fields.ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
+        return meshes.ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
     if kind == 1:
-        return fields.box((size * rng.uniform(0.35, 1.0, 3)).astype(np.float32), 0.12 * size)
+        return meshes.box((size * rng.uniform(0.35, 1.0, 3)).astype(np.float32), 0.12 * size)
     if kind == 2:
-        return fields.torus(size * rng.uniform(0.8, 1.2), size * rng.uniform(0.2, 0.4))
-    return fields.capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
+        return meshes.torus(size * rng.uniform(0.8, 1.2), size * rng.uniform(0.2, 0.4))
+    return meshes.capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
 
 
-def _place(field: fields.Field, rng: np.random.Generator, reach: Range) -> fields.Field:
+def _place(field: meshes.Field, rng: np.random.Generator, reach: Range) -> meshes.Field:
     direction = rng.normal(size=3)
     centre = direction / np.linalg.norm(direction) * rng.uniform(*reach)
-    return fields.moved(field, draw_rotation(rng), centre.astype(np.float32))
+    return meshes.moved(field, draw_rotation(rng), centre.astype(np.float32))
 
 
 Range = tuple[float, float]
@@ -111,11 +117,11 @@ Range = tuple[float, float]
 
 def _draw_waves(
     rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1, ridged: bool = False
-) -> fields.Field:
+) -> meshes.Field:
     """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its mean slope."""
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / ((4 if ridged else 2) * np.pi * frequency))
-    noise = fields.ridges(rng, frequency) if ridged else fields.waves(rng, frequency, outputs)
+    noise = meshes.ridges(rng, frequency) if ridged else meshes.waves(rng, frequency, outputs)
     return lambda points: height * noise(points)
 
 
@@ -134,12 +140,12 @@ def draw_carved(rng: np.random.Generator) -> Mesh | None:
         bent = points + bend(points)
         shape = solids[0](bent)
         for solid in solids[1:]:
-            shape = fields.smooth_union(shape, solid(bent), blend)
+            shape = meshes.smooth_union(shape, solid(bent), blend)
         for tool in tools:
-            shape = fields.smooth_cut(shape, tool(bent), seam)
+            shape = meshes.smooth_cut(shape, tool(bent), seam)
         return shape - folds(bent) if folds else shape
 
-    mesh = fields.triangulate(distance, (1.25, 1.25, 1.25), SPACING)
+    mesh = meshes.triangulate(distance, (1.25, 1.25, 1.25), SPACING)
     return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
 
 
@@ -151,7 +157,7 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
     craters = [
         _place(
-            fields.ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
+            meshes.ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
         )
         for _ in range(rng.integers(0, 9))
     ]
@@ -160,11 +166,11 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
         bent = points + bend(points)
         shape = np.linalg.norm(bent, axis=1) - np.float32(0.7) - swell(bent) - detail(bent)
         for crater in craters:
-            shape = fields.smooth_cut(shape, crater(bent), 0.05)
+            shape = meshes.smooth_cut(shape, crater(bent), 0.05)
         # Noise makes the field steeper. Scale it, so that it stays close to a distance.
         return np.asarray(shape * np.float32(0.7))
 
-    mesh = fields.triangulate(distance, (1.3, 1.3, 1.3), SPACING)
+    mesh = meshes.triangulate(distance, (1.3, 1.3, 1.3), SPACING)
     return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
 
 
@@ -173,7 +179,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
     swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
     pits = [_place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))]
-    slab = fields.box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
+    slab = meshes.box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
 
     def distance(points: Floats) -> Floats:
         bent = points + bend(points)
@@ -181,10 +187,10 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
         flat = bent * np.array((1, 1, 0.3), dtype=np.float32)
         shape: Floats = (bent[:, 2] - swell(flat) - folds(flat)) * np.float32(0.7)
         for pit in pits:
-            shape = fields.smooth_cut(shape, pit(bent), 0.05)
+            shape = meshes.smooth_cut(shape, pit(bent), 0.05)
         return np.maximum(shape, slab(points))
 
-    return fields.triangulate(distance, (1.09, 1.09, 0.85), SPACING)
+    return meshes.triangulate(distance, (1.09, 1.09, 0.85), SPACING)
 
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
@@ -207,15 +213,15 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
         azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.float32(twist) * points[:, 2]
         radius = profile(height) * (1 + np.float32(depth) * np.cos(flutes * azimuth))
         side = (np.hypot(points[:, 0], points[:, 1]) - radius) * np.float32(0.75)
-        outer = fields.smooth_cut(side, half_height - np.abs(points[:, 2]), 0.08)
+        outer = meshes.smooth_cut(side, half_height - np.abs(points[:, 2]), 0.08)
         # The inside is the outside, moved inwards by the wall, and open at the top.
-        inner = fields.smooth_cut(side + wall, points[:, 2] - floor, 0.25)
-        shape = fields.smooth_cut(outer, inner, 0.03)
+        inner = meshes.smooth_cut(side + wall, points[:, 2] - floor, 0.25)
+        shape = meshes.smooth_cut(outer, inner, 0.03)
         for extra in extras:
-            shape = fields.smooth_union(shape, extra(points), 0.04)
+            shape = meshes.smooth_union(shape, extra(points), 0.04)
         return shape - folds(points) if folds else shape
 
-    mesh = fields.triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
+    mesh = meshes.triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
     if mesh is None:
         return None
     tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
@@ -240,3 +246,66 @@ KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {
     "relief": draw_relief,
     "vessel": draw_vessel,
 }
+
+
+_LEAST_Z = 0.1  # lowest z to which a relief turns a normal that was higher
+_STEEPEST = 4.0  # largest slope that is read from a normal map
+
+
+def read_relief(path: Path) -> Floats:
+    """Read a tileable normal map, RGB = (n + 1) / 2, as the slopes (h, w, 2) of its height along its columns and rows.
+
+    Whether green points up or down is found from the slopes: those of a surface have no curl. Raises InputError if the
+    file is not a colour image. The vectors need no unit length.
+    """
+    normals = 2 * read_image(path) - 1
+    if normals.shape[2] != 3:
+        raise InputError("found a gray image, expected a normal map", path=path)
+    slopes = -normals[..., :2] / np.maximum(normals[..., 2:], 1 / _STEEPEST)
+    slopes = (slopes - slopes.mean(axis=(0, 1))).clip(-_STEEPEST, _STEEPEST)
+    along_rows, along_columns = np.gradient(slopes[..., 0], axis=0), np.gradient(slopes[..., 1], axis=1)
+    down = np.square(along_rows - along_columns).sum() < np.square(along_rows + along_columns).sum()
+    return np.asarray(slopes if down else slopes * np.array((1, -1)), np.float32)
+
+
+@dataclass(frozen=True)
+class Relief:
+    """A relief, projected along three axes: each point of a surface uses the axis that is nearest to its normal."""
+
+    slopes: Floats  # (h, w, 2), of the height along the columns and the rows
+    axes: Floats  # (3, 3), orthonormal rows
+    period: float  # width of one tile; the camera's square is 2 wide
+
+    def bend(self, normals: Floats, positions: Floats) -> Floats:
+        """Return the normals (N, 3) of points (N, 3) of a surface with this relief.
+
+        A normal that would turn away from the camera is turned by less.
+        """
+        local, places = normals @ self.axes.T, positions @ self.axes.T / np.float32(self.period)
+        first = (np.abs(local).argmax(axis=1) + 1) % 3
+        second, rows = (first + 1) % 3, np.arange(len(normals))
+        height, width = self.slopes.shape[:2]
+        columns, lines = (places[rows, axis] % 1 for axis in (first, second))
+        slopes = self.slopes[
+            np.minimum((lines * height).astype(int), height - 1), np.minimum((columns * width).astype(int), width - 1)
+        ]
+        rise = slopes[:, :1] * self.axes[first] + slopes[:, 1:] * self.axes[second]
+        rise -= (rise * normals).sum(axis=1, keepdims=True) * normals
+        turned = unit(normals - rise)
+        lowest = np.minimum(normals[:, 2:], _LEAST_Z)
+        fall = np.maximum(normals[:, 2:] - turned[:, 2:], 1e-6)
+        return unit(normals + np.minimum(1, (normals[:, 2:] - lowest) / fall) * (turned - normals))
+
+
+def draw_detail(slopes: Floats, size: int, rng: np.random.Generator) -> Relief:
+    """Draw a relief from the slopes of a normal map, for images of `size` pixels a side.
+
+    A tile is 10^U(-0.6, 0.4) wide, in units of half the frame. The root mean square of the slopes, in the resolution of
+    a third of a pixel, is U(0.05, 0.6). The axes are uniform over all rotations.
+    """
+    period = float(10 ** rng.uniform(-0.6, 0.4))
+    side = max(8, round(1.5 * size * period))
+    if side < min(slopes.shape[:2]):
+        slopes = np.asarray(cv2.resize(slopes, (side, side), interpolation=cv2.INTER_AREA))
+    steepness = rng.uniform(0.05, 0.6) / max(float(np.sqrt(np.square(slopes).sum(axis=2).mean())), 1e-3)
+    return Relief(slopes * np.float32(steepness), draw_rotation(rng), period)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _PROBLEMS = {
     "cluster": "--workers above 1 and --cluster need the package distributed, which is not installed",
     "exr": "EXR files need the package OpenEXR, which is not installed",
+    "heif": "HEIC images need the package pillow-heif, which is not installed",
     "mesh": "--decimate needs the package fast-simplification, which is not installed",
     "raw": "camera RAW files need rawpy, which is not installed",
     "render": "rendering needs embreex and scikit-image, which are not all installed",

@@ -21,13 +21,20 @@ from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.publishing import held_folder
-from splinecli.training.checkpoint import RunCounters, load_checkpoint, read_checkpoint_config, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.config_files import Settings, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
-from splinecli.training.run_log import Metrics, RunLog, none_for_nan
+from splinecli.training.run_files import (
+    Metrics,
+    RunCounters,
+    RunLog,
+    load_checkpoint,
+    none_for_nan,
+    read_checkpoint_config,
+    save_checkpoint,
+)
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
 
 

@@ -47,7 +47,7 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
     Image.fromarray(RGB).save(folder / "owl_normal.tga")
     capture = read_capture(folder)
     assert capture.n_lights == 6
-    (found,) = [w for w in capture.warnings if w.code == capture_warnings.IMAGES_LEFT_OUT]
+    (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
     assert str(found).startswith("owl.mask.bmp and 1 more: left out")
 
 
@@ -57,9 +57,9 @@ def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -
     Image.fromarray(RGB[:2]).save(folder / "thumb.png")
     capture = read_capture(folder)
     np.testing.assert_array_equal(capture.observations, whole.observations)
-    (found,) = [w for w in capture.warnings if w.code == capture_warnings.IMAGES_LEFT_OUT]
+    (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
     assert str(found).startswith("thumb.png: left out, because light_directions.txt has no light for it")
-    Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "seventh.png")
+    Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "006.png")
     with pytest.raises(InputError, match="found 6 light directions, expected 8"):
         read_capture(folder)
 

@@ -121,7 +121,7 @@ def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64])
         with pytest.raises(InputError, match=message):
             read_normals(path, MASK)
     (tmp_path / "a.exr").touch()
-    with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png or \.tif'):
+    with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png, \.tif or \.bmp'):
         read_normals(tmp_path / "a.exr", MASK)
 
 

@@ -191,8 +191,8 @@ def names_of(images: Sequence[Path]) -> list[str]:
 def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
     touch(tmp_path, "img2.NEF", "IMG2.jpg", "img10.nef", "img10.tif", "img10.jpg", "img3.png", "img3.jpg", "notes.txt")
     listed = list_images(tmp_path, leave_out_stems=(), leave_out=())
-    # Of img2 the RAW file and not the camera's copy, of img10 what was developed; without a RAW file, all count.
-    assert names_of(listed) == ["img2.NEF", "img3.jpg", "img3.png", "img10.tif"]
+    # Of img2 the RAW file and not the camera's copy, of img10 what was developed, of img3 the PNG.
+    assert names_of(listed) == ["img2.NEF", "img3.png", "img10.tif"]
 
 
 def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import io
 import logging
 import math
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -86,6 +87,7 @@ def stderr_is_apart() -> bool:
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 _LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture
 
+_MOST_PAGES = 10_000
 _LONGEST_TAG = 1 << 24  # values, such as the bytes of a colour profile
 _MOST_PARTS = 1 << 18  # strips or tiles
 _PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or tile
@@ -118,37 +120,60 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
     return pixels
 
 
+_PAGE = re.compile(r"(.+\.tiff?)\[(\d{1,4})\]", re.IGNORECASE)
+
+
+def page_of(path: Path) -> tuple[Path, int]:
+    """Return the file and the number, from 0, of a page as `pages` names it; 0 for any other path."""
+    found = _PAGE.fullmatch(path.name)
+    return (path, 0) if found is None else (path.with_name(found[1]), int(found[2]))
+
+
+def pages(path: Path) -> list[Path]:
+    """Return a path for each page of a TIFF file, such as stack.tif[0]; the file alone for another or a damaged one."""
+    try:
+        with path.open("rb") as file, first_page(file, path) as page:
+            count = len(page.parent.pages)
+    except (InputError, OSError):
+        return [path]
+    return [path.with_name(f"{path.name}[{number}]") for number in range(count)] if 1 < count < _MOST_PAGES else [path]
+
+
 @contextmanager
 def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
-    """Yield the first page of an open TIFF file. What tifffile raises for a damaged file becomes an InputError."""
+    """Yield the first page of an open TIFF file, or that which the path names. Raises InputError for a damaged file."""
     import tifffile
 
     logger = logging.getLogger("tifffile")
     before, logger.disabled = logger.disabled, True  # the error says what a user needs
     try:
         with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
-            _check_tags(file)
+            number = page_of(path)[1]
+            _check_tags(file, number)
             file.seek(0)
-            with tifffile.TiffFile(file, name=path.name) as pages:
-                yield pages.pages.first
+            with tifffile.TiffFile(file, name=path.name) as stored:
+                yield stored.pages[number] if number else stored.pages.first
     finally:
         logger.disabled = before
 
 
-def _check_tags(file: BinaryIO) -> None:
-    """Raise ValueError for a tag with millions of values, because tifffile reads tags as a whole."""
+def _check_tags(file: BinaryIO, number: int) -> None:
+    """Raise ValueError for a tag with millions of values in a page up to this one: tifffile reads tags as a whole."""
     start = file.read(16)
     order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
     big = 43 in start[2:4]  # BigTIFF has wider numbers
-    number, length, entry = (8, 8, 20) if big else (4, 2, 12)
-    file.seek(int.from_bytes(start[8:16] if big else start[4:8], order))
-    count = int.from_bytes(file.read(length), order)
-    entries = file.read(min(count, 1 << 16) * entry)
-    for place in range(0, len(entries), entry):
-        tag = int.from_bytes(entries[place : place + 2], order)
-        values = int.from_bytes(entries[place + 4 : place + 4 + number], order)
-        if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
-            raise ValueError
+    bytes_of, length, entry = (8, 8, 20) if big else (4, 2, 12)
+    following = start[8:16] if big else start[4:8]
+    for _ in range(number + 1):
+        file.seek(int.from_bytes(following, order))
+        count = int.from_bytes(file.read(length), order)
+        entries = file.read(min(count, 1 << 16) * entry)
+        for place in range(0, len(entries), entry):
+            tag = int.from_bytes(entries[place : place + 2], order)
+            values = int.from_bytes(entries[place + 4 : place + 4 + bytes_of], order)
+            if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
+                raise ValueError
+        following = file.read(8 if big else 4)
 
 
 def _decode_page(page: Any) -> Array | None:

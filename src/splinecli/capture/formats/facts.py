@@ -7,6 +7,7 @@ the EXIF tags, and tifffile the tags of TIFF.
 from __future__ import annotations
 
 import math
+import re
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,12 +23,14 @@ from splinecli.capture.formats.decoders import (
     RAW_SUFFIXES,
     damage_as_input_error,
     first_page,
+    page_of,
     raw_size,
     read_shot,
 )
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, LARGEST_PROFILE, SRGB, TransferCurve, profile_curve
 from splinecli.system.files import check_file, reading
+from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -35,14 +38,16 @@ if TYPE_CHECKING:
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP"}
-"""The first bytes of the files. Those of a PNG are the longest."""
+_STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP", b"P5": "PGM", b"P6": "PPM"}
+_BRANDS = {b"WEBP": "WEBP", b"avif": "AVIF", b"avis": "AVIF", b"heic": "HEIF", b"heix": "HEIF", b"mif1": "HEIF"}
+"""The first bytes of the files, or the bytes from the ninth on, after a length and RIFF or ftyp."""
 
-PILLOW_KINDS = ("BMP", "TGA")  # kinds of files that Pillow reads, of 8 bits and without a transfer curve
+PILLOW_KINDS = ("BMP", "TGA", "WEBP", "AVIF", "HEIF")  # kinds of files that Pillow reads, of 8 bits
+_PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")  # width, height and the largest value
 StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as stored, and the bytes of each number
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
-_KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
+_KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
 """EXIF tags of the exposure and of the focal length; see Exposure and calibration/balls.py."""
 
 _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF and DNG
@@ -82,6 +87,11 @@ class ImageFacts:
     exif: Mapping[int, Any] | None = field(default_factory=dict)
     damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
 
+    @property
+    def stated_channels(self) -> int | None:
+        """The number of channels, with alpha; None where the header states none."""
+        return None if self.stated_size is None else (*self.stated_size[0], 1)[2]
+
     @cached_property
     def size(self) -> StoredSize:
         """The size as stored. Raises InputError for a damaged file. Opening a RAW file takes long."""
@@ -106,17 +116,20 @@ def read_facts(path: Path) -> ImageFacts:
 @contextmanager
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
     """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
-    check_file(path, "an image")
-    with reading(path), path.open("rb") as file:
-        start, suffix = file.read(len(PNG)), path.suffix.lower()
+    stored, _ = page_of(path)
+    check_file(stored, "an image")
+    with reading(path), stored.open("rb") as file:
+        start, suffix = file.read(12), path.suffix.lower()
         file.seek(0)
         if not start:
             raise InputError("the file is empty", path=path)
         otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
+        if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
+            found = _BRANDS.get(start[8:], found)
         kind = "RAW" if suffix in RAW_SUFFIXES else found
         if kind is None:
-            raise InputError("found neither PNG, TIFF, JPEG nor BMP", path=path)
+            raise InputError("found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path)
         yield file, kind
 
 
@@ -128,9 +141,28 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)
-            return ImageFacts(path, kind, ((picture.height, picture.width, channels), 1))
+            size = (picture.height, picture.width, channels), 1
+            if kind in ("BMP", "TGA"):  # they state nothing else
+                return ImageFacts(path, kind, size)
+            curve = _curve(StatedCurve(SRGB, kind), picture.info.get("icc_profile"))
+            exif = _exif_tags(lambda tags: tags.load(picture.info.get("exif") or b""))
+            return ImageFacts(path, kind, size, curve, exif=exif)
+    if kind in ("PGM", "PPM"):
+        width, height, most, _ = pnm_header(file.read(_LONGEST_HEADER)) or (0, 0, 0, 0)
+        shape = (height, width, 1 if kind == "PGM" else 3)
+        level = most if 255 < most < 65_535 else None
+        return ImageFacts(path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level)
     read = {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind]
     return read(file, path)
+
+
+_LONGEST_HEADER = 4096  # bytes of a PGM or PPM before its pixels
+
+
+def pnm_header(start: bytes) -> tuple[int, int, int, int] | None:
+    """Return width, height, largest value and place of the pixels of a PGM or PPM; None for a damaged one."""
+    found = _PNM.match(start[:_LONGEST_HEADER])
+    return None if found is None else (int(found[1]), int(found[2]), int(found[3]), found.end())
 
 
 @contextmanager
@@ -138,6 +170,9 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
     """Yield a picture of PILLOW_KINDS, whose pixels are not read yet. Raises InputError."""
     from PIL import Image
 
+    if kind == "HEIF":
+        otherwise = "export the photographs as 16-bit TIFF or PNG"
+        import_extra("pillow_heif", "heif", error=InputError, path=path, otherwise=otherwise).register_heif_opener()
     with damage_as_input_error(path, DAMAGED), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures, which are checked later
         yield Image.open(file, formats=[kind])
@@ -334,6 +369,29 @@ def check_exposures(images: Sequence[ImageFacts]) -> None:
             hint = "Expose all images alike, or give each image's exposure as the intensity of its light"
             problem = f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
             raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
+
+
+def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | None:
+    """Return the exposure of each image, relative to their mean, and a sentence about them; None for equal ones.
+
+    Images without a stated exposure are refused beside images with different ones, as in check_exposures.
+    """
+    try:
+        check_exposures(images)
+        return None
+    except InputError:
+        found = [exposure for facts in images if (exposure := find_exposure(facts)) is not None]
+        if len(found) < len(images):
+            raise
+    mean = sum(exposure.relative for exposure in found) / len(found)
+    darkest, brightest = (choose(found, key=lambda exposure: exposure.relative) for choose in (min, max))
+    text = f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
+    tags = [facts.exif or {} for facts in images]
+    words = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
+    automatic = [word for word, tag in words.items() if any(of_image.get(tag) == 0 for of_image in tags)]
+    if automatic:
+        text += f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
+    return [exposure.relative / mean for exposure in found], text
 
 
 def common_orientation(images: Sequence[ImageFacts]) -> int:

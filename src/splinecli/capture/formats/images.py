@@ -25,6 +25,7 @@ from splinecli.capture.formats.decoders import (
     decode_raw,
     decode_tiff,
     native_stderr,
+    page_of,
 )
 from splinecli.capture.formats.facts import (
     PILLOW_KINDS,
@@ -34,6 +35,7 @@ from splinecli.capture.formats.facts import (
     facts_in,
     open_image,
     open_with_pillow,
+    pnm_header,
 )
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Singles
@@ -172,12 +174,21 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         pixels = decode_tiff(file, path)
         if pixels is not None:
             return pixels
+        if page_of(path)[1]:  # OpenCV reads the first page
+            hint = "Save it without compression, or each page as a file"
+            raise InputError("this page of the TIFF cannot be decoded", path=path, hint=hint)
         file.seek(0)
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             mode = {"1": "L", "L": "L", "LA": "LA", "RGBA": "RGBA"}.get(picture.mode, "RGB")
             return np.asarray(picture.convert(mode))
     data = file.read()
+    if kind in ("PGM", "PPM"):
+        width, height, most, start = pnm_header(data) or (0, 0, 0, 0)
+        shape, dtype = (height, width, 1 if kind == "PGM" else 3), ">u2" if most > 255 else "u1"
+        if len(data) < start + math.prod(shape) * np.dtype(dtype).itemsize:
+            raise InputError(f"the {kind} is truncated", path=path, hint=COPY_AGAIN)
+        return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(dtype[-2:])
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)
     return _decode_with_opencv(data)

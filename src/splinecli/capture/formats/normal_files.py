@@ -37,7 +37,7 @@ from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
 _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")  # of a depth
-_GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff")
+_GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp")
 
 _CLEARLY_BETTER = 0.02  # share of the mask's pixels
 _LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
@@ -103,7 +103,7 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Singles, bool]:
     suffix = path.suffix.lower()
     if suffix not in _GROUND_TRUTH_SUFFIXES:
         raise InputError(
-            f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png or .tif', path=path
+            f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or .bmp', path=path
         )
     if suffix != ".txt":
         stored = _read_vectors(path, ExpectedSize(mask.shape, "the images", "a ground truth"))

@@ -43,7 +43,7 @@ class Row(NamedTuple):
     """A row of numbers, its one-based line in the file, and this line as written, without comments."""
 
     numbers: tuple[float, ...]
-    line: int
+    line: int | None  # None in a file without lines, such as JSON
     text: str = ""
 
 
@@ -54,6 +54,8 @@ class NumberRows:
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
     names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
+    intensities: Doubles | None = None  # (R, 3), RGB, of the lights of a file that has them
+    are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
 
     def as_array(self) -> Doubles:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
@@ -150,6 +152,9 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
     content = [(line, text) for line, text in content if text.strip(" ,;")]
+    if content and content[0][1][0] in "[(":  # a list as Python or NumPy prints it
+        parts = [(line, part) for line, text in content for part in re.split(r"[\])]", text)]
+        content = [(line, text) for line, part in parts if (text := part.strip(" \t,;[("))]
     commas = uses_decimal_commas([text for _, text in content], n_numbers)
     return [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
 

@@ -1,17 +1,29 @@
-"""The log of a run: metrics.csv, curves.png, maps.png and, on request, TensorBoard's event files."""
+"""The files of a run: its log (metrics.csv, curves.png, maps.png, TensorBoard's event files) and its checkpoints.
+
+A checkpoint is one safetensors file from which a run continues where it stopped. It contains no state of a random
+generator: the draws of a step follow from the seed and the step number alone. A run of the refinement net photographs
+its newest captures again, and goes on without the earlier ones.
+"""
 
 import csv
+import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.files import CURVES, TRAINING_MAPS
-from splinecli.errors import OutputError
+import torch
+from torch import Tensor
+
+from splinecli.errors import ModelError, OutputError
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, serialise, tensors_sha256
+from splinecli.output_files import CURVES, TRAINING_MAPS
 from splinecli.pictures.plots import observation_map_figure, png_bytes, training_figure
 from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.machine import import_extra
 from splinecli.system.publishing import refuse_link
+from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.tasks import SampleMaps
 
@@ -146,3 +158,91 @@ def _open_events(folder: Path, step: int) -> Any:
     writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter
     with refusals_as_output_errors(folder):
         return writer(str(folder), purge_step=step + 1)
+
+
+FORMAT = "splinecli-checkpoint-2"
+_COUNTERS_KEY = "clock"  # the name of this entry in checkpoints of every version so far
+
+
+@dataclass
+class RunCounters:
+    """Steps, training pixels and seconds of training so far."""
+
+    step: int = 0
+    pixels: int = 0
+    seconds: float = 0.0
+
+
+def save_checkpoint(
+    path: Path,
+    config: TrainingConfig,
+    network: SplineNet,
+    average: SplineNet,
+    optimizer: torch.optim.Optimizer,
+    counters: RunCounters,
+    sets: dict[str, str],
+) -> None:
+    """Write the whole state of a run: the network with its running average, and the SHA-256 of each pixel set by path.
+
+    Raises OutputError.
+    """
+    tensors: dict[str, Tensor] = {}
+    for prefix, module in (("network", network), ("average", average)):
+        tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
+    for index, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
+    plain = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+    }
+    metadata = {
+        "format": FORMAT,
+        "config": json.dumps(config.to_dict()),
+        _COUNTERS_KEY: json.dumps(asdict(counters)),
+        "sets": json.dumps(sets),
+        "tensors_sha256": tensors_sha256(plain),
+    }
+    write_bytes(path, serialise(plain, metadata))
+
+
+def read_checkpoint_config(path: Path) -> TrainingConfig:
+    """Read the configuration of the run that wrote a checkpoint. Raises ModelError."""
+    _, metadata = _read(path)
+    return TrainingConfig.from_dict(read_json_entry(metadata, "config", path))
+
+
+def load_checkpoint(
+    path: Path, network: SplineNet, average: SplineNet, optimizer: torch.optim.Optimizer, sets: dict[str, str]
+) -> RunCounters:
+    """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
+
+    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has changed.
+    """
+    tensors, metadata = _read(path)
+    for name, sha256 in read_json_entry(metadata, "sets", path).items():
+        if sets.get(name) != sha256:
+            raise ModelError(
+                f"the pixel set {name} has changed since the run was started",
+                path=path,
+                hint="Restore the pixel set, or start another run with another -o",
+            )
+    load_strictly(network, _under("network.", tensors), path)
+    load_strictly(average, _under("average.", tensors), path)
+    states: dict[int, dict[str, Tensor]] = {}
+    try:
+        for name, tensor in _under("optimizer.", tensors).items():
+            index, _, key = name.partition(".")
+            states.setdefault(int(index), {})[key] = tensor
+        optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+        counters = RunCounters(**read_json_entry(metadata, _COUNTERS_KEY, path))
+        return RunCounters(int(counters.step), int(counters.pixels), float(counters.seconds))
+    except (TypeError, ValueError, KeyError) as error:
+        raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    hint = "Start a run without --resume. If this file is damaged, remove it or choose another -o"
+    return read_tensors(path, FORMAT, hint)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import CaptureSource
+from splinecli.capture.formats.decoders import page_of
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.light_check import LightCheck, check_lights
@@ -25,7 +26,7 @@ from splinecli.system.files import equal_files, reading
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class CaptureSample:
     """F images and their lights as the checks see them; what several checks need is found once."""
 
     names: Sequence[str]
@@ -58,12 +59,12 @@ class Evidence:
         *,
         truth: Floats | None = None,
         strict: bool = False,
-    ) -> Evidence:
+    ) -> CaptureSample:
         """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
         (sample, closeup), lamps = samples, source.lamps
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
-            copies = equal_files(images)
+            copies = equal_files(images) if page_of(images[0])[0] == images[0] else []
         return cls(
             [image.name for image in images],
             source.light_directions,
@@ -102,8 +103,8 @@ class Evidence:
         if self.lamps is None:
             return self.sample.observations
         lamps = self.lamps.choose_lights(self.indices)
-        near, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
-        observations = self.sample.observations / strengths
+        near, attenuation = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
+        observations = self.sample.observations / attenuation
         scaled_normals = solve_each(observations, near)
         return np.asarray(observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals))
 

@@ -1,0 +1,265 @@
+"""Readers of light files that are not lines of numbers: RTI's .lp, AliceVision's JSON, Relight's .dome, other JSON, and
+matrices of NumPy, MATLAB and OpenCV. Each returns rows of numbers, some with the names of their images.
+
+A reader takes the path, the number of images if it is known, and the meaning of a row. Each raises InputError for a
+file that it cannot read. A file may have several matrices: the lights are the only one N x 3 or 3 x N that fits the
+images.
+"""
+
+import json
+import math
+import re
+import reprlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.numbers import (
+    MOST_TEXT,
+    NumberRows,
+    Row,
+    check_length,
+    parse_number,
+    read_lines,
+    read_matrices,
+    read_text,
+    split_words,
+    to_number,
+    uses_decimal_commas,
+)
+from splinecli.capture.light_rows import RowForm, image_name
+from splinecli.errors import InputError
+from splinecli.maths import Doubles
+from splinecli.system.files import parse_json
+
+_MOST_DIGITS = 9  # of the number of lights
+
+
+def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may contain spaces.
+
+    The number may be missing, as other programs leave it out.
+    """
+    stored = read_lines(path, else_latin_1=True)
+    content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
+    if not content:
+        raise InputError("the file is empty, expected the number of lights on the first line", path=path)
+    (first, count), *rows = content
+    words = count.split()
+    if len(words) > 3 and None not in map(to_number, words[-3:]):
+        rows = content
+    elif not count.isdecimal():
+        raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
+    elif int(count[:_MOST_DIGITS]) != len(rows):
+        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
+        raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
+    if not rows:
+        raise InputError("the file contains no lights", path=path, line=first)
+    names, vectors = [], []
+    commas = uses_decimal_commas([text for _, text in rows], 3)
+    for line, text in rows:
+        words = text.rsplit(maxsplit=3)
+        if len(words) < 4:
+            raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
+        names.append(image_name(words[0], []))
+        numbers = split_words(" ".join(words[1:]), decimal_commas=commas)
+        vectors.append(Row(tuple(parse_number(word, path, line) for word in numbers[:3]), line, text))
+    return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
+
+
+def read_alicevision(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read AliceVision's lights: objects with viewId, type (directional), direction [x, y, z], intensity [r, g, b]."""
+    document = _read_document(path)
+    lights = document.get("lights") if isinstance(document, dict) else None
+    if not isinstance(lights, list) or not lights:
+        problem = 'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
+        raise InputError(problem, path=path)
+    names, vectors, intensities = [], [], []
+    for number, light in enumerate(lights, start=1):
+        if not isinstance(light, dict):
+            raise InputError(f"light {number} is not an object", path=path)
+        kind = light.get("type", "directional")
+        if kind != "directional":
+            problem = f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'"
+            raise InputError(problem, path=path, hint="Calibrate for distant lights, one direction a light")
+        names.append(image_name(str(light.get("viewId", number)), []))
+        x, y, z = _three_numbers(light, "direction", number, path)
+        vectors.append((x, -y, -z))
+        if "intensity" in light:
+            intensities.append(_three_numbers(light, "intensity", number, path))
+            if (least := min(intensities[-1])) <= 0:
+                raise InputError(f"light {number} has the intensity {least:g}, expected above 0", path=path)
+    if intensities and len(intensities) != len(lights):
+        problem = f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none"
+        raise InputError(problem, path=path)
+    return _unnumbered(path, vectors, names, intensities)
+
+
+_DOME_POSITIONS = ("positions3d", "positionsSphere", "positions")
+
+
+def is_dome(path: Path) -> bool:
+    """Return whether a JSON file is a dome of Relight."""
+    document = _read_document(path)
+    return isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
+
+
+def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up) and z (camera).
+
+    Positions are taken for positions of lamps. ledAdjust, by which Relight multiplies the images, gives intensities.
+    """
+    document = _read_document(path)
+    if not isinstance(document, dict):
+        raise InputError("found no object, expected a dome as Relight writes it", path=path)
+    positions = _DOME_POSITIONS
+    if document.get("lightConfiguration") == "spherical":
+        positions = ("positionsSphere", "positions3d", "positions")
+    keys = positions if form == "positions" else ("directions", *positions)
+    key = next((key for key in keys if document.get(key)), None)
+    if key is None:
+        raise InputError(f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path)
+    vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb")
+    if vectors is None or any(len(vector) != 3 for vector in vectors):
+        raise InputError(f'the list "{key}" has not x, y and z for each light', path=path)
+    adjusted = factors is not None and len(factors) == len(vectors) and min(map(min, factors)) > 0
+    intensities = [[1 / factor for factor in light] for light in factors] if adjusted and factors else []
+    return _unnumbered(path, vectors, None, intensities)
+
+
+def is_list(path: Path) -> bool:
+    """Return whether a JSON file is a plain list of lights; see read_json_list."""
+    return _listed(_read_document(path)) is not None
+
+
+def read_json_list(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read a list [[x, y, z], ...], or an object with the light of each image by its name."""
+    listed = _listed(_read_document(path))
+    if listed is None:
+        raise InputError("found no list of x y z, one for each image", path=path)
+    names, vectors = listed
+    rows = tuple(Row(tuple(vector), line) for line, vector in enumerate(vectors, start=1))
+    return NumberRows(path, rows, names)
+
+
+def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
+    if isinstance(document, dict) and len(document) == 1 and isinstance(next(iter(document.values())), list):
+        (inner,) = document.values()
+        document = document if _vectors(inner) is None else inner
+    if isinstance(document, dict):
+        vectors = _vectors(list(document.values()))
+        return None if vectors is None else (tuple(image_name(name, []) for name in document), vectors)
+    vectors = _vectors(document)
+    return None if vectors is None else (None, vectors)
+
+
+def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
+    """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None for anything else."""
+    if not isinstance(values, list) or not values:
+        return None
+    vectors: list[Any] = [[each.get(key) for key in keys] if isinstance(each, dict) else each for each in values]
+    if not all(isinstance(vector, list) and len(vector) > 1 and all(map(_is_finite, vector)) for vector in vectors):
+        return None
+    return [[float(number) for number in vector] for vector in vectors]
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _unnumbered(
+    path: Path, vectors: Iterable[Sequence[float]], names: Sequence[str] | None, intensities: Sequence[Sequence[float]]
+) -> NumberRows:
+    """Return vectors of a file without lines."""
+    rows = tuple(Row(tuple(vector), None) for vector in vectors)
+    given = np.array(intensities, np.float64) if intensities else None
+    return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
+
+
+def _read_document(path: Path) -> Any:
+    """Return the value of a JSON file. Raises InputError."""
+    try:
+        return parse_json("\n".join(read_lines(path)))
+    except json.JSONDecodeError as error:
+        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+    except ValueError as error:
+        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
+
+
+def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
+    values = light.get(key)
+    numbers = [float(value) for value in (values if isinstance(values, list) else ()) if _is_finite(value)]
+    if len(numbers) != 3 or len(values or ()) != 3:
+        raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
+    return numbers
+
+
+# OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
+# No part may run over what another one begins with: a file of 1 MB would take minutes.
+_YAML = re.compile(
+    r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
+    r"\s+data:\s*\[([^][:]*)\]",
+    re.MULTILINE,
+)
+_XML = re.compile(
+    r"<([\w.-]+)\s+type_id=\"opencv-matrix\"\s*>\s*<rows>\s*(\d{1,9})\s*</rows>\s*<cols>\s*(\d{1,9})\s*</cols>"
+    r"\s*<dt>[^<]*</dt>\s*<data>([^<]*)</data>"
+)
+
+
+def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count them from 1."""
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        array = _read_npy(path)
+    else:
+        check_length(path, MOST_TEXT)
+        array = _choose(read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
+        raise InputError(
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3", path=path
+        )
+    rows = enumerate(array.astype(np.float64).tolist(), start=1)
+    return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
+
+
+def _choose(matrices: Mapping[str, Doubles], path: Path, n_images: int | None) -> Doubles:
+    """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
+    lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
+    if len(lights) > 1:
+        lights = {name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))} or lights
+    if len(lights) == 1:
+        return next(iter(lights.values()))
+    sizes = ", ".join(f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items())
+    problem = f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x N{f': {sizes}' if sizes else ''}"
+    hint = "Write the light directions into a text file, a line x y z for each image"
+    raise InputError(problem, path=path, hint=hint)
+
+
+def _read_npy(path: Path) -> NDArray[np.generic]:
+    check_length(path, MOST_TEXT)
+    try:
+        with path.open("rb") as file:
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
+        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
+
+
+def _read_opencv(path: Path) -> dict[str, Doubles]:
+    """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
+    text = read_text(path).decode(errors="replace")
+    found: dict[str, Doubles] = {}
+    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
+        try:
+            numbers = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
+            found[name] = numbers.reshape(int(rows), int(columns))
+        except ValueError:
+            raise InputError(
+                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}", path=path
+            ) from None
+    return found

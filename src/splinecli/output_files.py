@@ -1,0 +1,150 @@
+"""The files that splinecli writes for people: their names, and one row of MAPS for each map that `infer` may add.
+
+What the row says decides how the map is made, written, read back, drawn and shown, how much memory it takes, and that
+its pictures are no photographs. The functions are named, because they need rooms above this one.
+"""
+
+from dataclasses import dataclass
+
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+
+NORMALS = {
+    "png": "normals.png",
+    "png8": "normals_8bit.png",
+    "npy": "normals.npy",
+    "tiff": "normals.tiff",
+    "exr": "normals.exr",
+}
+"""The file of the normal map in each format."""
+
+ERROR_MAP = "error_map.png"
+REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
+FOUND_LIGHTS = FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = (
+    "light_directions.txt",
+    "light_intensities.txt",
+    "lights.png",
+)
+"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
+
+PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
+    "calibration.png",
+    "light_noise.png",
+    "contact_sheet.png",
+    "curves.png",
+    "maps.png",
+)
+"""Pictures that the other commands write."""
+
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values that are white in the pictures, by default
+BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputMap:
+    """A row of MAPS.
+
+    name: in --maps; the files have it with each of the suffixes.
+    make: "module:function" from a capture's source, its NormalEstimate and a progress function, called after each
+        image, to float32 values (H, W) or (H, W, C), or None where there are none.
+    content: for the documentation. unit: what TIFF and EXR files say of the values.
+    picture: "module:function" from values and mask, and with a scale from this, to an 8-bit picture.
+    scale: the value that is white in the picture, unless the user gives another; scale_text: what its file says of it.
+    caption: below the picture on the page, which has this map even if --maps does not name it; "" leaves it out.
+    needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
+    bytes_per_pixel, bytes_per_observation: of memory. A map that takes any is made before the others are written.
+    """
+
+    name: str
+    make: str
+    content: str
+    unit: str = ""
+    suffixes: tuple[str, ...] = ("npy", "tiff", "png")
+    picture: str = "splinecli.pictures.maps:signed_picture"
+    scale: float | None = None
+    scale_text: str = ""
+    caption: str = ""
+    needs_confidence: bool = False
+    reads_images: bool = False
+    bytes_per_pixel: int = 0
+    bytes_per_observation: int = 0
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The names of its files by suffix."""
+        return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
+
+
+_ROWS = (
+    OutputMap(
+        name="albedo",
+        make="splinecli.results.maps:albedo",
+        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear RGB, up to one scale."
+        " The picture is 8-bit sRGB, the EXR file float16",
+        unit="linear RGB",
+        suffixes=("npy", "exr", "png"),
+        picture="splinecli.pictures.maps:albedo_picture",
+        caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
+        reads_images=True,
+        bytes_per_pixel=52,  # the colours of two images, sums and the map
+        bytes_per_observation=1,
+    ),
+    OutputMap(
+        name="confidence",
+        make="splinecli.results.maps:confidence",
+        content="the probability that a normal has an error of at most 5 degrees; float32, H x W, zero outside the"
+        " mask; white is 1",
+        suffixes=("npy", "png"),
+        picture="splinecli.pictures.maps:confidence_picture",
+        caption="Confidence: the probability that the normal is at most 5° off, from 0 (black) to 1 (white)",
+        needs_confidence=True,
+    ),
+    OutputMap(
+        name="preview",
+        make="splinecli.results.maps:normals",
+        content="the surface in matte white under a raking light from the upper left",
+        suffixes=("png",),
+        picture="splinecli.pictures.maps:preview_picture",
+    ),
+    OutputMap(
+        name="gradient",
+        make="splinecli.results.maps:gradient",
+        content="the slopes dz/dx and dz/dy; float32, H x W x 2, NaN outside the mask",
+        unit="slopes dz/dx and dz/dy, x right, y up",
+        suffixes=("npy", "tiff"),
+    ),
+    OutputMap(
+        name="curvature",
+        make="splinecli.results.maps:curvature",
+        content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
+        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 for each part",
+        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
+        scale=CURVATURE_SCALE,
+        scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
+    ),
+    OutputMap(
+        name="relief",
+        make="splinecli.results.maps:relief",
+        content="heights without the overall shape; float32, H x W, in pixels, NaN outside the mask. The high-pass"
+        " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
+        unit="heights in pixels",
+        scale=RELIEF_SCALE,
+        scale_text="height, black -{scale}, gray 0, white {scale} pixels",
+        bytes_per_pixel=BYTES_OF_SURFACE,
+    ),
+)
+MAPS = {row.name: row for row in _ROWS}
+SCALED_MAPS = tuple(row.name for row in _ROWS if row.scale is not None)
+
+
+def own_files() -> list[str]:
+    """Return the names of all files that `infer` and `integrate` may write into a folder, but FOUND_LIGHTS."""
+    return [
+        *NORMALS.values(),
+        ERROR_MAP,
+        *(name for row in MAPS.values() for name in row.files.values()),
+        *file_names(tuple(SURFACE_FILES)),
+        SURFACE_REPORT,
+        FOUND_MASK,
+        PAGE,
+        REPORT,
+    ]

@@ -1,0 +1,293 @@
+"""Captures as people have them: names, formats and folders that are not the usual ones, and what is said of them.
+
+The oracle is a matte sphere: whatever its files are called, the normals are those of its geometry.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+from splinecli.diagnosis.evidence import Evidence
+
+import scenes
+from splinecli.calibration.balls import find_ball_files
+from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
+from splinecli.capture.formats.images import decode_image
+from splinecli.capture.light_files import read_light_positions
+from splinecli.diagnosis.checks import check_evidence
+from splinecli.diagnosis.summary import summarise_capture
+from splinecli.errors import InputError, UsageError
+from splinecli.inference import estimate_normals
+from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.transfer import encode_srgb
+from splinecli.methods import make_estimator
+
+SIZE = 32
+LIGHTS = scenes.spiral_lights(12, 40)
+NORMALS, DISC = scenes.sphere(SIZE, 0.6)
+PICTURES = np.rint(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000).astype(np.uint16)
+MASK = DISC.astype(np.uint8) * 255
+
+Change = Callable[[Path], Path | None]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a capture without a mask."""
+    return scenes.write_capture(tmp_path / "cat", PICTURES, LIGHTS)
+
+
+def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
+    """Compare the normals with the geometry, and return the codes of the warnings."""
+    capture = source.read(as_stored=True)
+    assert mask is None or (capture.mask == mask).all()
+    normals = estimate_normals(capture, make_estimator("ls")).normal_map
+    inside = capture.mask & DISC
+    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a degree.
+    assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
+    return [warning.code for warning in capture.warnings]
+
+
+def picture(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+@pytest.mark.parametrize("name", ["cat_mask.png", "cat.mask.tif", "mask_1.png", "../cat_mask.png", "../cat.mask.bmp"])
+def test_masks_by_name(folder: Path, name: str) -> None:
+    picture(folder / name, MASK)
+    source = open_capture(folder)
+    assert check(source) == ["mask_choice"]
+    assert str(source.warnings[0]).startswith(f"{Path(name).name} is used as the mask, by its name.")
+
+
+def test_two_masks_are_named_and_none_is_used(folder: Path) -> None:
+    picture(folder / "mask_left.png", MASK)
+    picture(folder / "mask_right.png", MASK)
+    picture(folder / "mask_small.png", MASK[::2, ::2])
+    source = open_capture(folder)
+    assert check(source, np.ones_like(DISC)) == ["mask_choice"]
+    expected = "mask_left.png, mask_right.png: none is used as the mask. Choose one with --mask FILE."
+    assert str(source.warnings[0]) == expected
+    assert check(open_capture(folder, mask=folder / "mask_left.png")) == ["images_left_out"]
+
+
+def test_alpha_is_a_mask_if_there_is_no_other(folder: Path) -> None:
+    for number, image in enumerate(PICTURES):
+        picture(folder / f"{number:03}.png", np.dstack([image] * 3 + [MASK.astype(np.uint16) * 257]))
+    source = open_capture(folder)
+    assert check(source) == ["mask_choice"]
+    assert "The alpha channel of 000.png is used as the mask." in str(source.warnings[0])
+    picture(folder / "mask.png", np.full_like(MASK, 255))
+    assert check(open_capture(folder), np.ones_like(DISC)) == []
+
+
+def test_ball_masks(folder: Path) -> None:
+    (folder / "light_directions.txt").unlink()
+    picture(folder / "chrome.mask.png", MASK)
+    files = find_ball_files(folder)
+    assert len(files.images) == 12 and files.mask == folder / "chrome.mask.png"
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_images_in_a_folder_of_their_own(folder: Path, listed: bool) -> None:
+    (folder / "images").mkdir()
+    for path in folder.glob("*.png"):
+        path.rename(folder / "images" / path.name)
+    if listed:
+        (folder / "filenames.txt").write_text("".join(f"{number:03}.png\n" for number in range(12)))
+    picture(folder / "cat_mask.png", MASK)
+    source = open_capture(folder)
+    assert check(source) == ["mask_choice"]
+    assert source.files.name == "cat" and len(source.files.images) == 12
+
+
+def test_bmp_ground_truth(folder: Path) -> None:
+    picture(folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8))
+    truth = open_capture(folder, mask=None).read().ground_truth
+    assert truth is not None and angle_between_deg(truth[DISC], NORMALS[DISC]).max() < 1
+
+
+def rows(vectors: np.ndarray = LIGHTS) -> list[list[float]]:
+    return vectors.tolist()
+
+
+def angles(form: str) -> str:
+    slant, tilt = np.degrees([np.arccos(LIGHTS[:, 2]), np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0])])
+    columns = (tilt, 90 - slant) if form == "azel" else (tilt, slant)
+    return "\n".join(f"{first:.9f} {second:.9f}" for first, second in zip(*columns, strict=True))
+
+
+LINES = "\n".join(" ".join(map(str, row)) for row in rows())
+NAMED = "\n".join(f"{number:03}.png {' '.join(map(str, row))}" for number, row in enumerate(rows()))
+OPENCV = f"%YAML:1.0\nLights: !!opencv-matrix\n   rows: 12\n   cols: 3\n   dt: d\n   data: {LIGHTS.ravel().tolist()}\n"
+XYZ = [dict(zip("xyz", row, strict=True)) for row in rows()]
+FOUND = {
+    "csv": ("lights.csv", "x,y,z\n" + LINES.replace(" ", ",")),
+    "csv with names": ("lights.csv", "image,x,y,z\n" + NAMED.replace(" ", ",")),
+    "list": ("lights.txt", str(rows())),
+    "list of lines": ("lights.txt", str(rows()).replace("],", "],\n")),
+    "printed by NumPy": ("lights.txt", str(LIGHTS)),
+    "tuples": ("light_directions.txt", "\n".join(str(tuple(row)) for row in rows())),
+    "lp without a count": ("dome.lp", NAMED),
+    "OpenCV": ("LightMatrix.yml", OPENCV),
+    "OpenCV by object": ("cat_LightMatrix.yml", OPENCV),
+    "JSON list": ("lights.json", json.dumps(rows())),
+    "JSON with a key": ("light_directions.json", json.dumps({"L": rows()})),
+    "JSON by name": ("lights.json", json.dumps({f"{number:03}.png": row for number, row in enumerate(rows())})),
+    "Relight": ("a.dome", json.dumps({"lightConfiguration": "directional", "directions": XYZ, "positions3d": []})),
+    "Relight with LEDs": ("a.dome", json.dumps({"directions": XYZ, "ledAdjust": [dict.fromkeys("rgb", 1.0)] * 12})),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FOUND)
+def test_light_files(folder: Path, case: str) -> None:
+    (folder / "light_directions.txt").unlink()
+    name, text = FOUND[case]
+    (folder / name).write_text(text)
+    assert check(open_capture(folder), None) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "hint"),
+    [
+        ("../lights.txt", LINES, r"Add --lights .*lights\.txt\."),
+        ("dirs.txt", LINES, r"Add --lights .*cat/dirs\.txt\."),
+        (
+            "TiltSlant.txt",
+            "tilt slant\n" + angles("slant-tilt"),
+            r"Add .*Slant\.txt --light-format slant-tilt",
+        ),
+        ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --light-format azel"),
+    ],
+)
+def test_light_files_that_are_named(folder: Path, name: str, text: str, hint: str) -> None:
+    """The option of the message reads the file."""
+    (folder / "light_directions.txt").unlink()
+    (folder / name).write_text(text)
+    with pytest.raises(InputError, match=hint) as refused:
+        open_capture(folder)
+    _, lights, *form = str(refused.value.hint).removeprefix("Add ").split()
+    options = {"lights_format": form[1]} if form else {}
+    assert check(open_capture(folder, lights=lights, **options), None) == []
+
+
+def test_a_dome_has_positions(folder: Path) -> None:
+    lamps = LIGHTS * 300 + (0, 0, 20)
+    positions = [dict(zip("xyz", row, strict=True)) for row in rows(lamps)]
+    dome = {"lightConfiguration": "spherical", "directions": XYZ, "positionsSphere": positions, "positions3d": XYZ}
+    (folder / "a.dome").write_text(json.dumps(dome))
+    np.testing.assert_allclose(read_light_positions(folder / "a.dome", 12), lamps, rtol=1e-12)
+    (folder / "a.dome").write_text(json.dumps({"directions": XYZ}))
+    with pytest.raises(InputError, match=r"found no list of positions3d or .*, expected a dome"):
+        read_light_positions(folder / "a.dome", 12)
+
+
+@pytest.mark.parametrize("vector", ["0.1 0.2 -0.1", "0 0 0"])
+def test_one_bad_light_is_left_out(folder: Path, vector: str) -> None:
+    lines = LINES.splitlines()
+    lines[4] = vector
+    (folder / "light_directions.txt").write_text("\n".join(lines))
+    source = open_capture(folder)
+    assert check(source, None) == ["images_left_out"]
+    assert str(source.warnings[0]).startswith("004.png (z = ") and source.n_lights == 11
+    assert source.places_of([0, 3, 5, 11]) == [0, 3, 4, 10]
+    with pytest.raises(UsageError, match=r"light 4 was left out"):
+        source.places_of([0, 1, 4])
+    (folder / "light_directions.txt").write_text("\n".join([*lines[:-1], vector]))
+    with pytest.raises(InputError, match=":5: found a"):
+        open_capture(folder)
+
+
+def test_copies_are_one_photograph(folder: Path) -> None:
+    for number, image in enumerate(PICTURES):
+        picture(folder / f"{number:03}.jpg", (image >> 8).astype(np.uint8))
+    source = open_capture(folder)
+    assert check(source, None) == ["images_left_out"]
+    assert str(source.warnings[0]).startswith("12 files (.jpg) have the names of other images (.png)")
+
+
+def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) -> None:
+    for name in ("demo.png", "result_1.png", "result_2.png"):
+        picture(folder / name, PICTURES[0])
+    source = open_capture(folder)
+    assert check(source, None) == ["images_left_out"]
+    assert "no light for them, and the other images have another form of name" in str(source.warnings[0])
+    assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
+    for number in (12, 13):
+        picture(folder / f"{number:03}.png", PICTURES[0])
+    with pytest.raises(InputError, match=r"found 12 light directions, expected 17.* none is left for 012\.png"):
+        open_capture(folder)
+
+
+def write_pnm(path: Path, image: np.ndarray, most: int) -> None:
+    path.with_suffix(".pgm").write_bytes(
+        b"P5 # camera\n%d %d\n%d\n" % (*image.shape[::-1], most) + image.astype(">u2").tobytes()
+    )
+
+
+def write_stack(folder: Path) -> None:
+    tifffile.imwrite(folder / "stack.tif", PICTURES, photometric="minisblack")
+
+
+WRITERS = {
+    "16-bit PGM": lambda folder: [write_pnm(folder / f"{n}", PICTURES[n], 65535) for n in range(12)],
+    "12-bit PGM": lambda folder: [write_pnm(folder / f"{n}", PICTURES[n] >> 4, 4095) for n in range(12)],
+    "PPM": lambda folder: [picture(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)],
+    "stack": write_stack,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_images_of_other_formats(folder: Path, form: str) -> None:
+    for path in folder.glob("*.png"):
+        path.unlink()
+    WRITERS[form](folder)
+    picture(folder.parent / "mask.png", MASK)
+    source = open_capture(folder, mask=folder.parent / "mask.png")
+    assert source.n_lights == 12
+    check(source)
+    if form == "12-bit PGM":
+        assert source.facts[0].white_level == 4095
+    if form == "stack":
+        assert source.files.images[3].name == "stack.tif[3]"
+        assert check_evidence(Evidence.of_source(source, summarise_capture(source).samples, range(12)))[1] == []
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".avif", ".heic"])
+def test_display_encoded_formats(folder: Path, suffix: str) -> None:
+    """An 8-bit photograph with the sRGB curve, stored with little or no loss."""
+    if suffix == ".heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    for number, image in enumerate(encode_srgb(PICTURES / 65535)):
+        (folder / f"{number:03}.png").unlink()
+        options = {"lossless": True} if suffix == ".webp" else {"quality": 100}
+        Image.fromarray(np.dstack([image] * 3)).save(folder / f"{number:03}{suffix}", **options)
+    picture(folder.parent / "mask.png", MASK)
+    capture = open_capture(folder, mask=folder.parent / "mask.png").read(as_stored=True)
+    assert "display_decoded" in [warning.code for warning in capture.warnings]
+    normals = estimate_normals(capture, make_estimator("ls")).normal_map
+    # Steps of 8 bits are half a percent of the brightness.
+    assert angle_between_deg(normals[DISC], NORMALS[DISC]).mean() < 0.5
+
+
+def test_formats_that_need_an_extra_or_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in folder.glob("*.png"):
+        path.rename(path.with_suffix(".heic"))
+        path.with_suffix(".heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0" + bytes(64))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"000\.heic: .*pip install 'splinecli\[heif\]'"):
+        open_capture(folder).read()
+    for path in folder.glob("*.heic"):
+        path.rename(path.with_suffix(".jxl"))
+    with pytest.raises(InputError, match=r"contains no images, but 12 \.jxl files\. PNG,"):
+        open_capture(folder)
+    (folder / "a.pgm").write_bytes(b"P5 40 30 255\n" + bytes(100))
+    with pytest.raises(InputError, match="the PGM is truncated"):
+        decode_image(folder / "a.pgm")

@@ -1,0 +1,124 @@
+"""Methods, maps and warnings are rows of tables: one row adds one everywhere, and nothing tests for it by name."""
+
+import re
+import sys
+from pathlib import Path
+from pkgutil import resolve_name
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import make_tables
+import splinecli
+from html_page import REPORT
+from splinecli.capture import Capture
+from splinecli.capture.files import NOT_PHOTOGRAPHS
+from splinecli.capture_warnings import WARNINGS, CaptureWarning, WarningKind
+from splinecli.diagnosis import checks
+from splinecli.errors import InputError
+from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.methods import METHODS, Estimator, Method, make_estimator, method_names
+from splinecli.output_files import MAPS, OutputMap, own_files
+from splinecli.pipeline.infer import results_bytes
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.results.maps import chosen_maps, make_map, map_files
+from splinecli.results.pages import result_page
+
+SOURCE = Path(splinecli.__file__).parent
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
+def capture() -> Capture:
+    observations = np.ones((6, 4), np.float32)
+    return Capture("flat", observations, LIGHTS, tuple(range(4)), np.ones((2, 3), np.bool_))
+
+
+@pytest.mark.parametrize("name", make_tables.PAGES)
+def test_tables_of_the_documentation(name: str) -> None:
+    """`python docs/make_tables.py` writes them."""
+    text = (make_tables.DOCS / name).read_text("utf-8")
+    assert text == make_tables.fill(text)
+    assert "<!-- table: " in text
+
+
+def test_no_method_is_known_by_its_name_or_has_hidden_hooks() -> None:
+    names = "|".join(METHODS)
+    by_name = re.compile(rf"""(?<!grid) [!=]= "(?:{names})"|startswith\("(?:spline|cnn)|(?:get|has)attr\(estimator""")
+    assert [path.name for path in SOURCE.rglob("*.py") if by_name.search(path.read_text("utf-8"))] == []
+
+
+class Flat(Estimator):
+    """Says that every pixel faces the camera."""
+
+    name = fingerprint = "flat"
+
+    def estimate(self, observations, light_directions, *, progress=None):  # type: ignore[no-untyped-def]
+        return np.tile((0.0, 0.0, 1.0), (len(observations), 1))
+
+    def warn_of_lights(self, n_lights: int) -> list[str]:
+        return [f"{n_lights} lights are not needed."]
+
+
+def test_a_method_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(METHODS, "flat", Method(lambda name, options: Flat(), "a constant", "nobody"))
+    assert method_names()[-1] == "flat"
+    assert "| `flat` | a constant | nobody |" in make_tables.methods_table()
+    estimate = estimate_normals(capture(), make_estimator("flat"))
+    assert np.array_equal(estimate.normal_map, np.tile(np.float32((0, 0, 1)), (2, 3, 1)))
+    assert estimate.confidence_map is None
+
+
+def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    uniform = WarningKind("uniform", "All values are equal", "Photograph an object", severity="error")
+    monkeypatch.setitem(WARNINGS, uniform.code, uniform)
+    assert "| `uniform` | All values are equal | Photograph an object | error |" in make_tables.warnings_table()
+
+    def check(seen: checks.CaptureSample) -> list[CaptureWarning]:
+        return [CaptureWarning(uniform, "All values are equal.")] if np.ptp(seen.observations) == 0 else []
+
+    monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(check)])
+    warnings = checks.check_arrays(capture())
+    assert "uniform" in [warning.code for warning in warnings]
+    with pytest.raises(InputError, match="All values are equal"):
+        checks.refuse_if_strict(warnings[-1:], "flat", strict=True)
+
+
+def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = OutputMap(
+        name="slant",
+        make="test_tables:slant",
+        content="cosine between normal and camera axis",
+        unit="cosine",
+        scale=1.0,
+        scale_text="cosine, black -{scale}, white {scale}",
+        caption="Slant",
+        bytes_per_pixel=7,
+    )
+    monkeypatch.setitem(MAPS, "slant", row)
+    monkeypatch.setitem(sys.modules, "test_tables", sys.modules[__name__])
+    mask, estimate = np.ones((2, 3), np.bool_), estimate_normals(capture(), make_estimator("ls"))
+    assert chosen_maps(["slant", "preview"])[-1] is row
+    assert row in chosen_maps([], page=True)
+    values = make_map(row, None, estimate)  # type: ignore[arg-type]
+    assert dict(map_files(row, values, mask, ["npy"])).keys() == {"slant.npy", "slant.png"}
+    assert dict(map_files(row, values, mask, ["tiff"])).keys() == {"slant.npy", "slant.tiff", "slant.png"}
+    assert {"slant.npy", "slant.tiff", "slant.png"} <= set(own_files())  # so that it is no photograph
+    assert "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera axis |" in (
+        make_tables.maps_table()
+    )
+    assert results_bytes(100, 4, maps=["slant"]) - results_bytes(100, 4) == 700
+    page = result_page(REPORT, estimate.normal_map, mask, values={"slant": values})
+    assert "<figcaption>Slant</figcaption>" in page
+    assert InferOptions(maps=("slant",)).maps == ("slant",)
+
+
+def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray[np.float32]:
+    return estimate.normal_map[..., 2]
+
+
+@pytest.mark.parametrize("row", MAPS.values(), ids=list(MAPS))
+def test_functions_of_the_maps_exist(row: OutputMap) -> None:
+    assert callable(resolve_name(row.make))
+    assert "png" not in row.suffixes or callable(resolve_name(row.picture))
+    assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == ("npy",)
