@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.errors import InputError, OutputError, printable
-from splinecli.pipeline.options import (
-    CalibrateOptions,
-    EvaluateOptions,
-    ImportOptions,
-    IntegrateOptions,
-    PrepareOptions,
-    TrainOptions,
-)
 from splinecli.training import defaults
 
 if TYPE_CHECKING:
     from splinecli.evaluation.protocol import Evaluation
+    from splinecli.pipeline.options import (
+        CalibrateOptions,
+        EvaluateOptions,
+        ImportOptions,
+        IntegrateOptions,
+        PrepareOptions,
+        TrainOptions,
+    )
     from splinecli.training.loop import Trainer
     from splinecli.training.run_files import Metrics
 

@@ -10,21 +10,20 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from typer import Context
 
-from splinecli.capture_warnings import PROBABLY_WRONG
 from splinecli.cli.console import Messages, print_lines, print_report
 from splinecli.errors import InputError, UsageError, printable
-from splinecli.pipeline.infer_options import (
-    BatchOptions,
-    ClusterOptions,
-    InferOptions,
-    InfoOptions,
-    Reading,
-    WatchOptions,
-)
-from splinecli.results.pages import HEADER, INDEX, Entry, Row
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome
+    from splinecli.pipeline.infer_options import (
+        BatchOptions,
+        ClusterOptions,
+        InferOptions,
+        InfoOptions,
+        Reading,
+        WatchOptions,
+    )
+    from splinecli.results.pages import Row
 
 _WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the last line, for these outcomes
 
@@ -65,6 +64,7 @@ def _show_all(
     summaries: bool,
 ) -> int:
     from splinecli.pipeline.batch import Status, worst_exit_code
+    from splinecli.results.pages import HEADER, INDEX, Entry
 
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
@@ -94,6 +94,8 @@ def _show_all(
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:
+    from splinecli.capture_warnings import PROBABLY_WRONG
+
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
     scored = ""
     if errors is not None:
@@ -164,6 +166,7 @@ def info(reading: Reading, options: InfoOptions) -> int:
     the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing
     but the plot and the mended lights.
     """
+    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.pipeline.info import describe_capture, summary_lines
 
     messages = Messages(quiet=options.quiet)

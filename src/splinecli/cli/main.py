@@ -11,9 +11,10 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -24,7 +25,7 @@ from splinecli import __version__
 from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
 from splinecli.cli.console import DEFECT, Messages, ParserError, error_document, explain, print_lines, printed_documents
 from splinecli.cli.infer import infer, info, watch
-from splinecli.cli.options import command
+from splinecli.cli.options import command, help_of
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.system.machine import check_address_space, keep_freed_memory
 
@@ -32,12 +33,29 @@ HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Type
 INFER = "infer"  # the command whose JSON is a list of documents
 JSON, JSON_LINES = "--json", "--jsonl"
 
+_FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
+    "splinecli.pipeline.infer_options": (infer, watch, info),
+    "splinecli.pipeline.options": (calibrate, integrate, evaluate, prepare, train, import_weights),
+}
+COMMANDS = {each.__name__.replace("_", "-"): (each, module) for module, part in _FUNCTIONS.items() for each in part}
+"""Name of a command -> its function, and the module that declares its options."""
+
 
 class Command(TyperCommand):
-    """A command that expands `~` in its arguments.
+    """A command that expands `~` in its arguments, and makes its options when they are asked for.
 
     With --json, a command that fails prints a document on stdout as well: {"error", "exit_code"}.
     """
+
+    @cached_property
+    def _made(self) -> Any:
+        alone = typer.Typer(add_completion=False)
+        alone.command()(command(*COMMANDS[str(self.name)]))
+        return typer.main.get_command(alone)
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return an attribute. Those that follow from the options are made now, as the options import much."""
+        return getattr(self._made, name) if name in ("params", "callback") else super().__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
@@ -134,8 +152,8 @@ def _splinecli(
     pass
 
 
-for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
-    app.command(cls=Command)(command(_command))
+for _name, (_function, _) in COMMANDS.items():
+    app.command(name=_name, help=help_of(_function), cls=Command)(lambda: None)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Iterator
+from importlib import import_module
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from msgspec import NODEFAULT
@@ -14,11 +15,14 @@ from typer import Option as TyperOption
 from splinecli.records import PANELS, Option, Record, complete_list, field_types, long_name, number_of, option_of, plain
 
 
-def command(function: Callable[..., int | None]) -> Callable[..., int | None]:
-    """Return a function for Typer that takes the options of a function's records, and calls it with the records."""
+def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
+    """Return a function for Typer that takes the options of a function's records, and calls it with the records.
+
+    The module has the records. It is imported here, as it takes time that the help of other commands does not need.
+    """
     records: dict[str, type[Record]] = {}
     parameters = []
-    for name, kind in get_type_hints(function).items():
+    for name, kind in get_type_hints(function, localns=vars(import_module(module))).items():
         if kind is Context:
             parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind))
         elif name != "return":
@@ -31,11 +35,16 @@ def command(function: Callable[..., int | None]) -> Callable[..., int | None]:
         made = {name: record.from_arguments(given) for name, record in records.items()}
         return function(**given, **made)
 
-    paragraphs = inspect.cleandoc(function.__doc__ or "").split("\n\n")
-    call.__name__, call.__doc__ = function.__name__, "\n\n".join(" ".join(text.split()) for text in paragraphs)
+    call.__name__, call.__doc__ = function.__name__, help_of(function)
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return call
+
+
+def help_of(function: Callable[..., object]) -> str:
+    """Return the text of a function's docstring, with a line for each paragraph."""
+    paragraphs = inspect.cleandoc(function.__doc__ or "").split("\n\n")
+    return "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
 
 def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
