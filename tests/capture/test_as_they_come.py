@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from splinecli.diagnosis.evidence import Evidence
 
 import scenes
 from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
-from splinecli.diagnosis.checks import check_evidence
+from splinecli.diagnosis.capture_sample import CaptureSample
+from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.summary import summarise_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.inference import estimate_normals
@@ -257,7 +257,7 @@ def test_images_of_other_formats(folder: Path, form: str) -> None:
         assert source.facts[0].white_level == 4095
     if form == "stack":
         assert source.files.images[3].name == "stack.tif[3]"
-        assert check_evidence(Evidence.of_source(source, summarise_capture(source).samples, range(12)))[1] == []
+        assert check_sample(CaptureSample.of_source(source, summarise_capture(source).samples, range(12)))[1] == []
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".avif", ".heic"])

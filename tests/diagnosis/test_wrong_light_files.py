@@ -165,7 +165,7 @@ def test_warnings_state_the_error_of_the_normals(fault: str) -> None:
     (normals, mask), (given, code) = ball(), FAULTS[fault]
     capture = Capture("ball", shade(normals, TWO_RINGS).astype(np.float32), given, np.arange(10), mask)
     warnings = check_arrays(capture, intensities=np.ones(len(capture.light_directions)))
-    stated = [warning.error_deg for warning in warnings if warning.code == code]
+    stated = [warning.error_deg for warning in warnings if warning.kind == code]
     assert stated and min(error or 0 for error in stated) > 10
 
 
@@ -175,7 +175,7 @@ def test_a_wrong_image_states_the_error_that_it_makes(fault: str) -> None:
     observations = shade(normals, TWO_RINGS).astype(np.float32)
     observations[:, 3] = 0 if fault == "black" else observations[:, 7]
     warnings = check_arrays(Capture("ball", observations, TWO_RINGS, np.arange(10), mask), intensities=np.ones(10))
-    assert [warning.code for warning in warnings][:1] == [
+    assert [warning.kind for warning in warnings][:1] == [
         kinds.IMAGE_INCONSISTENT if fault == "black" else kinds.REPEATED_IMAGES
     ]
     assert warnings[0].error_deg is not None

@@ -72,6 +72,8 @@ def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | No
     import cv2
 
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
+    if not n_pixels:
+        return None
     numbers = edge_numbers(observations, mask, around)
     if numbers is None or numbers[-1] > _SMOOTHEST:
         return None
