@@ -56,11 +56,12 @@ class Bench:
 
     def errors(self, folder: str, captures: Mapping[str, Path], method: str, **options: Any) -> list[Cells]:
         """Return {"label", "n_lights", "light_noise_deg", "mae_deg"} of each evaluation of a method."""
-        from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
+        from splinecli.pipeline.evaluate import evaluate_captures
+        from splinecli.pipeline.options import EvaluateOptions
 
         chosen = {"trials": self.trials, "max_pixels": 2000, "as_stored": True, **options}
-        chosen |= {"methods": (method,), "output": str(self.results / folder)}
-        document = evaluate_captures(list(captures.values()), EvaluateOptions(**chosen)).document
+        chosen |= {"methods": (method,), "output": str(self.results / folder), "datasets": tuple(captures.values())}
+        document = evaluate_captures(EvaluateOptions(**chosen)).document
         labels = {path.name: label for label, path in captures.items()}
         # mae_deg has four decimals; rounding it again may differ from what evaluate prints.
         return [

@@ -29,8 +29,8 @@ Array = NDArray[np.floating]
 FRAMES = {
     "x negated": "x-left",
     "y negated": "y-down",
-    "x and y exchanged": "exchanged",
-    "turned by 90 degrees": "exchanged,y-down",
+    "x and y exchanged": "swap-xy",
+    "turned by 90 degrees": "swap-xy,y-down",
     "x and y negated": "x-left,y-down",
 }
 FIRST_SCENE, SEED = 5000, 71

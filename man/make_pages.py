@@ -1,6 +1,7 @@
-"""Make the man pages, an overview and one page per command, from the commands: `python man/make_pages.py`."""
+"""Make the man pages and docs/reports.schema.json from the commands and documents: `python man/make_pages.py`."""
 
 import inspect
+import json
 import re
 import shlex
 import textwrap
@@ -11,7 +12,8 @@ from typing import Any
 import typer
 
 from splinecli import __version__
-from splinecli.cli.main import app, help_panels
+from splinecli.cli.main import app
+from splinecli.documents import json_schema
 from splinecli.output_files import MAPS
 
 EXIT_STATUS = {
@@ -85,6 +87,21 @@ EXAMPLES = {
     " then use --weights official.safetensors.",
 }
 EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
+
+
+def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
+    """Return the title of each panel of a command's help and its rows: names, and what they mean."""
+    panels: dict[str, list[tuple[str, str]]] = {}
+    for parameter in command.get_params(context):
+        if (record := parameter.get_help_record(context)) is None:
+            continue
+        term, meaning = record
+        title = getattr(parameter, "rich_help_panel", None) or "Options"
+        if parameter.param_type_name == "argument":
+            title, term, meaning = "Arguments", parameter.metavar, meaning.removesuffix("[required]")
+        meaning = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", meaning)
+        panels.setdefault(title, []).append((" ".join(term.split()), " ".join(meaning.split())))
+    return panels
 
 
 def man_pages() -> dict[str, str]:
@@ -208,3 +225,5 @@ def _escape(text: str) -> str:
 if __name__ == "__main__":
     for page, text in man_pages().items():
         (Path(__file__).parent / page).write_text(text, "utf-8")
+    schema = Path(__file__).parents[1] / "docs/reports.schema.json"
+    schema.write_text(json.dumps(json_schema(), indent=2) + "\n", "utf-8")

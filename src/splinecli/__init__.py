@@ -144,7 +144,7 @@ def integrate_normals(
     mask: NDArray[np.bool_] | None = None,
     camera_matrix: NDArray[np.floating] | None = None,
     *,
-    stiffness: float = 2.0,
+    discontinuity: float = 2.0,
 ) -> NDArray[np.float64]:
     """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
 
@@ -155,7 +155,7 @@ def integrate_normals(
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
         mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
+        discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
 
     Raises:
         splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
@@ -167,4 +167,4 @@ def integrate_normals(
     """
     from splinecli.surface.integration import integrate_normals
 
-    return integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness)
+    return integrate_normals(normal_map, mask, camera_matrix, discontinuity=discontinuity)

@@ -15,6 +15,8 @@ def run() -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         if not sys.warnoptions:  # python -W
             warnings.simplefilter("ignore")  # those of libraries, such as NumPy's
+            # Of Python's process that counts semaphores, too: SIGTERM may end this process first.
+            os.environ.setdefault("PYTHONWARNINGS", "ignore")
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
         from splinecli.cli.main import main
 

@@ -35,6 +35,7 @@ PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
 )
 """Pictures that the other commands write."""
 
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values that are white in the pictures, by default
 BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
 
 
@@ -117,7 +118,7 @@ _ROWS = (
         content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
         " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 for each part",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
-        scale=0.05,
+        scale=CURVATURE_SCALE,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
     ),
     OutputMap(
@@ -126,7 +127,7 @@ _ROWS = (
         content="heights without the overall shape; float32, H x W, in pixels, NaN outside the mask. The high-pass"
         " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
         unit="heights in pixels",
-        scale=1.0,
+        scale=RELIEF_SCALE,
         scale_text="height, black -{scale}, gray 0, white {scale} pixels",
         bytes_per_pixel=BYTES_OF_SURFACE,
     ),

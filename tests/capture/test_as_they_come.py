@@ -162,9 +162,9 @@ def test_light_files(folder: Path, case: str) -> None:
         (
             "TiltSlant.txt",
             "tilt slant\n" + angles("slant-tilt"),
-            r"Add .*Slant\.txt --lights-format slant-tilt",
+            r"Add .*Slant\.txt --light-format slant-tilt",
         ),
-        ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --lights-format azel"),
+        ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --light-format azel"),
     ],
 )
 def test_light_files_that_are_named(folder: Path, name: str, text: str, hint: str) -> None:

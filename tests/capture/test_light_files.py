@@ -234,7 +234,7 @@ def test_angles(tmp_path: Path, text: str | None) -> None:
     ],
 )
 def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"found {message}.*add --lights-format azel"):
+    with pytest.raises(InputError, match=f"found {message}.*add --light-format azel"):
         read_lights(write(tmp_path, text), text.count("\n") + 1)
 
 

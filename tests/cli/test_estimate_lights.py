@@ -35,7 +35,7 @@ def test_infer(unlit, run):
     result = run("infer", unlit, "--lights", "estimate", "--method", "ls", "--json", "--html")
     assert result.code == 0, result.err
     [report] = json.loads(result.out)
-    check(report, "report")
+    check(report, "Report")
     assert report["light_file"] is None
     assert "estimated_lights" in [warning["code"] for warning in report["warnings"]]
     assert {"light_directions.txt", "lights.png"} <= set(report["files"])
@@ -99,7 +99,7 @@ def test_evaluate(unlit, run):
     given = json.loads(run(*arguments).out)
     result = run(*arguments, "--lights", "estimate")
     estimated = json.loads(result.out)
-    check(estimated, "results")
+    check(estimated, "Results")
     assert given["results"][0]["found_light_error_deg"] is None
     error = estimated["results"][0]["found_light_error_deg"]
     assert 0 < error < 6
@@ -130,7 +130,7 @@ def test_first_light(unlit, run):
         ("infer", "ball", "--light-distance", "100"),
         ("infer", "ball", "--light-positions", "x.txt"),
         ("infer", "ball", "--light-frame", "x-left"),
-        ("infer", "ball", "--lights-format", "azel"),
+        ("infer", "ball", "--light-format", "azel"),
         ("infer", "ball", "--refine-lights"),
         ("info", "ball", "--check-lights"),
         ("evaluate", "ball", "--refine-lights"),
@@ -152,7 +152,7 @@ def test_a_film(run):
     result = run(*command, "--json")
     assert result.code == 0, result.err
     [report] = json.loads(result.out)
-    check(report, "report")
+    check(report, "Report")
     frames = sorted(Path("out/frames/clip").glob("*.png"))
     assert report["capture"] == "clip" and report["n_lights"] == len(frames) <= 24
     true = lights[[int(frame.stem.removeprefix("frame-")) for frame in frames]]

@@ -169,7 +169,7 @@ VIEWS = {
     "millimetres": "--pixel-size 0.5",
     "scale": "--scale 1/2 --pixel-size 0.5",
     "crop": "--crop 4,2,16,18 --pixel-size 0.5",
-    "stiffness": "--stiffness 0",
+    "discontinuity": "--discontinuity 0",
     "near": "--light-positions lamps.txt --pixel-size 2",
     "near camera": "--scale 1/2 --camera-matrix camera.txt",
     "perspective": "--light-positions lamps.txt --pixel-size 2 --camera-matrix camera.txt",
@@ -178,7 +178,7 @@ VIEWS = {
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
-    """Camera, pixel size, frame and stiffness of the results are in their report."""
+    """Camera, pixel size, frame and discontinuity of the results are in their report."""
     import trimesh
 
     np.savetxt("lamps.txt", BUMP_LAMPS)
@@ -309,7 +309,7 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
         ("options", "scale", 3),
         ("options", "pixel_size", [1]),
         ("options", "convention", None),
-        ("options", "stiffness", -1),
+        ("options", "discontinuity", -1),
         ("", "options", 7),
         ("", "options", {}),
         ("", "files", ["normals.npy", 5]),
@@ -347,7 +347,7 @@ def test_refusals(refuse):
     cases = (
         (2, []),
         (2, ["normals.npy", "--format", "fbx"]),
-        (2, ["normals.npy", "--stiffness", -1]),
+        (2, ["normals.npy", "--discontinuity", -1]),
         (2, ["normals.npy", "--pixel-size", 0]),
         (2, ["normals.npy", "--decimate", 0]),
         (3, ["dot.npy"]),

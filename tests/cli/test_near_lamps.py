@@ -85,13 +85,13 @@ REFUSED = [
     ("--light-distance 170", 2, "--light-distance needs the size of a pixel"),
     ("--light-distance 170 --light-positions l.txt", 2, "contradict each other"),
     ("--pixel-size 1 --object-width 2 --light-distance 3", 2, "contradict each other"),
-    ("--pixel-size -1", 2, "the pixel size is -1, expected a number above 0"),
+    ("--pixel-size -1", 2, "--pixel-size is '-1'; expected a number above 0"),
     ("--surface --pixel-size 1e9", 2, "the pixel size is 1e+09 mm, expected"),
     ("--pixel-size 1", 2, "--pixel-size concerns near lamps, and bump has no light_positions.txt"),
     ("--light-positions l.txt --lights l.txt", 2, "contradict each other"),
     ("--light-positions missing.txt", 3, "missing.txt: the file does not exist"),
     ("--light-positions l.txt", 3, "nothing tells the scale of the lamps' positions"),
-    ("--light-positions l.txt --pixel-size 1 --lights-format azel", 2, "concerns light directions"),
+    ("--light-positions l.txt --pixel-size 1 --light-format azel", 2, "concerns light directions"),
 ]
 
 
@@ -134,7 +134,7 @@ def test_a_near_camera_under_distant_lights(run, bump: Path) -> None:
     np.savetxt(bump / "camera_matrix.txt", matrix)
     assert "other input files" in run("infer", "bump", "--method", "ls").err
     found = infer(run)
-    check(found, "report")
+    check(found, "Report")
     assert (found["camera_matrix"], found["near_lamps"]) == (matrix.tolist(), None)
     assert found["inputs_sha256"] != orthographic["inputs_sha256"]
     assert found["angular_error_deg"] == orthographic["angular_error_deg"]
@@ -157,7 +157,7 @@ def test_a_file_of_lobes(run, near: Path) -> None:
     (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
     assert "other input files" in run("infer", "bump", "--method", "ls").err
     even = infer(run)
-    check(even, "report")
+    check(even, "Report")
     assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
     assert even["angular_error_deg"]["mean"] == pytest.approx(without["angular_error_deg"]["mean"], abs=1e-3)
     (near / "light_lobes.txt").write_text("0 0.2 -1 5\n")

@@ -147,7 +147,7 @@ def test_an_edited_mask_and_an_integrated_surface_stay(capture, run):
     (capture / "mask.png").unlink()
     call = ("infer", capture, "--method", "ls", "--auto-mask", "--surface")
     assert run(*call, "--overwrite").code == 0
-    assert run("integrate", "out/sphere", "--format", "ply", "--stiffness", 0, "--overwrite").code == 0
+    assert run("integrate", "out/sphere", "--format", "ply", "--discontinuity", 0, "--overwrite").code == 0
     assert run("integrate", "out/sphere", "--format", "ply", "--overwrite").code == 0
     with Path("out/sphere/found_mask.png").open("ab") as file:
         file.write(b"edited")

@@ -8,6 +8,7 @@ import jsonschema
 import pytest
 
 from splinecli.capture_warnings import WARNINGS
+from splinecli.documents import json_schema
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
 
@@ -29,7 +30,7 @@ def test_reports_of_infer(capture, run, arguments):
     [printed] = json.loads(run("infer", capture, *arguments, "--json").out)
     written = json.loads(Path("out/sphere/report.json").read_text("utf-8"))
     assert printed == written
-    check(written, "report")
+    check(written, "Report")
     assert (written["surface"] is None) == ("--surface" not in arguments)
     assert Path(written["light_file"]) == (capture / "light_directions.txt").absolute()
     assert Path(written["folder"]) == Path.cwd() / "out/sphere"
@@ -38,7 +39,7 @@ def test_reports_of_infer(capture, run, arguments):
 
 def test_reports_of_integrate(capture, run):
     assert run("infer", capture, "--method", "ls").code == 0
-    check(json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "surface_report")
+    check(json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "SurfaceReport")
 
 
 @pytest.mark.parametrize("lights", [["4"], ["4", "all"]])
@@ -48,12 +49,16 @@ def test_results_of_evaluate(make_capture, run, lights):
     arguments = ("--method", "ls", "--method", "l1", *chosen, "--trials", 2)
     document = json.loads(run("evaluate", "data", *arguments, "--json").out)
     assert document == json.loads(Path("evaluation/results.json").read_text("utf-8"))
-    check(document, "results")
+    check(document, "Results")
     for change in ({"colour": 1}, {"averages": {"ls": "good"}}):
         with pytest.raises(jsonschema.ValidationError):
-            check({**document, **change}, "results")
+            check({**document, **change}, "Results")
+
+
+def test_the_published_schema_is_that_of_the_documents():
+    """Made by `python man/make_pages.py`."""
+    assert json_schema() == SCHEMA
 
 
 def test_the_codes_of_warnings_are_those_of_the_source():
-    described = SCHEMA["$defs"]["report"]["properties"]["warnings"]["items"]["properties"]["code"]["enum"]
-    assert described == sorted(WARNINGS)
+    assert SCHEMA["$defs"]["WarningReport"]["properties"]["code"]["enum"] == sorted(WARNINGS)

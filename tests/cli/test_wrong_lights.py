@@ -82,7 +82,7 @@ def test_info_lists_the_readings(run, medallion):
     assert min(orders.values()) > rows[0]["misfit"]
     write_lights(medallion, lambda lights: lights[:, [1, 0, 2]])
     wrong = run("info", medallion, "--strict", "--check-lights")
-    assert wrong.code == 3 and "--light-frame exchanged" in wrong.err
+    assert wrong.code == 3 and "--light-frame swap-xy" in wrong.err
     assert "x and y exchanged  " in wrong.out
     assert "in reversed order, beginning with light" in wrong.out
     assert "advantage: evidence from curl and outline" in wrong.out
@@ -136,7 +136,7 @@ def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
         return np.degrees(np.stack((azimuth, np.arccos(lights[:, 2])), axis=1))
 
     write_lights(medallion, zenith_angles)
-    result = run("info", medallion, "--lights-format", "azel", "--strict", "--json")
+    result = run("info", medallion, "--light-format", "azel", "--strict", "--json")
     assert result.code == 3 and json.loads(result.out)["warning_codes"] == ["light_frame"]
     assert "much better if their elevations count from the camera axis (misfit" in result.err
     assert "Replace each elevation by 90 degrees minus it." in result.err

@@ -153,7 +153,7 @@ def test_misfits_are_those_of_least_squares() -> None:
 
 def test_the_columns_of_an_exchanged_file() -> None:
     # The file has y before x, and its y points down: (y, x, z) = (0.2, 0.5, 0.8) is x = 0.5, y = -0.2.
-    frame = parse_light_frame("exchanged, y-down")
+    frame = parse_light_frame("swap-xy, y-down")
     np.testing.assert_array_equal(np.array((0.2, 0.5, 0.8)) @ frame.matrix.T, (0.5, -0.2, 0.8))
     assert frame.describe() == "x and y exchanged, y negated"
 

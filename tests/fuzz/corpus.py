@@ -264,7 +264,7 @@ TARGETS = (
     Target("lights", light_files, ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"), (
         *each("infer . --method ls --lights {} -o out --overwrite",
               "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome"),
-        "infer . --method ls --lights azel.txt --lights-format azel -o out --overwrite",
+        "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
         "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
         " --overwrite",
     )),

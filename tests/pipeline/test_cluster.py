@@ -21,8 +21,8 @@ from splinecli.maths.normals import unit
 from splinecli.pipeline import batch
 from splinecli.pipeline import distribution as distribution_module
 from splinecli.pipeline.batch import Member, choose_workers, expected_bytes, infer_batch, list_captures
-from splinecli.pipeline.distribution import ClusterOptions, Distributor, Item, LostError, Work, distributor
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
+from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")

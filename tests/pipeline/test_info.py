@@ -2,7 +2,7 @@
 
 from typing import get_args
 
-from splinecli.pipeline.infer_options import REFINED_PIXELS
+from splinecli.pipeline.infer import REFINED_PIXELS
 from splinecli.pipeline.info import ORIGINS
 from splinecli.refinement.refiner import MARGIN, TILE
 from splinecli.restoration.images import Origin

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import UsageError
-from splinecli.pipeline.batch import Shard, list_captures
+from splinecli.pipeline.batch import list_captures
+from splinecli.pipeline.infer_options import Shard
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])

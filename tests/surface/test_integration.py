@@ -79,12 +79,12 @@ def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
 
 
 @pytest.mark.usefixtures("any_scale")
-@pytest.mark.parametrize("stiffness", [0, 2])
+@pytest.mark.parametrize("discontinuity", [0, 2])
 @pytest.mark.parametrize(("reach", "limit"), [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
-def test_sphere(reach: float, limit: float, stiffness: float) -> None:
+def test_sphere(reach: float, limit: float, discontinuity: float) -> None:
     # Up to the rim, where normals are grazing, the last pixel is off by more.
     normals, mask, truth = sphere(130, 150, 60, reach)
-    found = integrate_normals(normals, mask, stiffness=stiffness)
+    found = integrate_normals(normals, mask, discontinuity=discontinuity)
     assert error_share(found, truth, mask) < limit
     assert np.isnan(found[~mask]).all()
     assert found[mask].mean() == pytest.approx(0, abs=1e-9)
@@ -122,7 +122,7 @@ def test_levels_apart(monkeypatch: pytest.MonkeyPatch, coarse_from: int, joined:
     monkeypatch.setattr(integration, "_COARSEST", coarse_from)
     normals, truth, wall = levels(100, 120, 30, 2, joined)
     everywhere = np.ones(wall.shape, bool)
-    least_squares = integrate_normals(normals, everywhere, stiffness=0)
+    least_squares = integrate_normals(normals, everywhere, discontinuity=0)
     done: list[float] = []
     torn = integrate_normals(normals, everywhere, progress=done.append)
     assert error_share(least_squares, truth, ~wall) > 0.1
@@ -214,7 +214,7 @@ def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
     return matrices, constants
 
 
-def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Floats:
+def dense(normals: Floats, mask: Mask, discontinuity: float, iterations: int) -> Floats:
     """Return the heights (P,) by the pseudo-inverse, which have mean 0 in every part."""
     matrices, constants = equations(normals, mask)
     heights = np.zeros(np.count_nonzero(mask))
@@ -223,7 +223,7 @@ def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Flo
         for forth, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
             gaps = (matrices[back] @ heights) ** 2 - (matrices[forth] @ heights) ** 2
             residuals = [np.abs(matrices[side] @ heights + constants[side]) for side in (forth, back)]
-            share = 1 / (1 + np.exp(-stiffness * (iteration > 0) * gaps)) - 0.5
+            share = 1 / (1 + np.exp(-discontinuity * (iteration > 0) * gaps)) - 0.5
             weights.append(0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2))))
         root = np.sqrt(np.concatenate(weights))
         heights = np.linalg.lstsq(root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants))[0]
@@ -232,7 +232,7 @@ def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Flo
 
 def test_least_squares_is_the_dense_solution() -> None:
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
-    found = integrate_normals(normals, mask, stiffness=0)[mask]
+    found = integrate_normals(normals, mask, discontinuity=0)[mask]
     np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
 
 
@@ -240,7 +240,7 @@ def test_a_prior_is_the_dense_solution() -> None:
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     prior = np.random.default_rng(2).normal(size=mask.shape)
     prior[:, 12:] = np.nan  # parts there have mean height 0, in relation to the mean of the prior
-    found = integrate_normals(normals, mask, stiffness=0, prior=prior, prior_detail=8)[mask]
+    found = integrate_normals(normals, mask, discontinuity=0, prior=prior, prior_detail=8)[mask]
     matrices, constants = equations(normals, mask)
     known = np.isfinite(prior[mask])
     pulls = 2 * np.pi / 8 * np.eye(len(known))[known]
@@ -267,17 +267,17 @@ def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
     return unit(normals), heights, scan
 
 
-@pytest.mark.parametrize("stiffness", [0.0, 2.0])
+@pytest.mark.parametrize("discontinuity", [0.0, 2.0])
 @pytest.mark.usefixtures("any_scale")
-def test_a_prior_is_better_than_normals_and_scan_alone(stiffness: float) -> None:
+def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> None:
     normals, heights, scan = drifting()
     scan[80:95, 60:120] = np.nan
 
     def error(found: Floats) -> float:
         return float(np.nanstd(found - heights))
 
-    both = integrate_normals(normals, stiffness=stiffness, prior=scan)
-    assert 1.5 * error(both) < error(scan) < error(integrate_normals(normals, stiffness=stiffness))
+    both = integrate_normals(normals, discontinuity=discontinuity, prior=scan)
+    assert 1.5 * error(both) < error(scan) < error(integrate_normals(normals, discontinuity=discontinuity))
     assert abs(np.mean(both - heights)) < 0.1
 
 
@@ -336,7 +336,7 @@ def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
 def test_inputs_do_not_change_and_progress_is_reported() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     kept, calls = normals.copy(), []
-    integrate_normals(normals, mask, stiffness=0, progress=calls.append)
+    integrate_normals(normals, mask, discontinuity=0, progress=calls.append)
     assert np.array_equal(normals, kept) and calls == [1.0]
 
 
@@ -368,7 +368,7 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS, MASK, np.diag([9.0, 0, 1])), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA + 1e308), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA.T), {}, InputError, "is not a camera matrix"),
-        ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected"),
+        ((NORMALS, MASK), {"discontinuity": -1}, UsageError, "the discontinuity is -1, expected"),
     ],
 )
 def test_bad_input(arguments, options, error, message):
@@ -384,9 +384,9 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> No
     errors = gaussian_filter(np.random.default_rng(2).normal(size=normals.shape), (2, 2, 0))
     noisy = unit(normals + np.radians(8) * errors / errors.std())
     torn = {}
-    for stiffness in (0.0, 2.0):
-        found = integrate_normals(noisy, np.ones(x.shape, bool), stiffness=stiffness)
-        torn[stiffness] = float((np.abs(np.diff(found - truth, axis=1)) > 1.5).mean())
+    for discontinuity in (0.0, 2.0):
+        found = integrate_normals(noisy, np.ones(x.shape, bool), discontinuity=discontinuity)
+        torn[discontinuity] = float((np.abs(np.diff(found - truth, axis=1)) > 1.5).mean())
     assert torn[0] < torn[2] < 0.0125
 
 

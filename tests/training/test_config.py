@@ -39,7 +39,7 @@ def test_settings_left_out_have_their_defaults() -> None:
         ({"pixels": {"min_lights": 9, "max_lights": 8}}, "max_lights are 9, 10, 8; expected them in rising order"),
         ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
-        ({"sources": {"set": True}}, "the weight of source 'set' is True; expected a number from 0"),
+        ({"sources": {"set": True}}, "'sources' is {'set': True}; expected a table, each a number from 0"),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from splinecli.errors import ModelError, UsageError
+from splinecli.pipeline.options import parse_light_counts
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.config_files import (
     check_resumable,
     configure,
-    parse_light_counts,
     parse_parameter,
     parse_sources,
     read_config_file,

@@ -146,7 +146,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
                 for form in ("xyz", angles):
                     with suppress(InputError):
                         read_lights(path, n_images, form=form)
-                        return f"--lights {path}" + (f" --lights-format {form}" if form != "xyz" else "")
+                        return f"--lights {path}" + (f" --light-format {form}" if form != "xyz" else "")
     return None
 
 

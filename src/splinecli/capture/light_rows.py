@@ -31,7 +31,7 @@ AXIS_WORDS = {
 }
 """What --light-frame takes: the axis of the file and the sign with which it enters."""
 
-EXCHANGED = "exchanged"  # word for files whose first column is y and whose second is x
+EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in pro
 
 
 def parse_light_frame(text: str | None) -> LightFrame:
-    """Return the frame of a list such as "x-left,y-down,exchanged"; the usual one of None.
+    """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual one of None.
 
     Axes that the list does not name are as usual. Raises UsageError for an unknown word, and an axis that comes twice.
     """
@@ -113,7 +113,7 @@ COLUMNS: dict[RowForm, dict[int, str]] = {
 
 _ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 
-AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
+AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format azel"
 
 
 def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:

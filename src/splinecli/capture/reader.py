@@ -92,7 +92,7 @@ def open_capture(
     near = None if find_lights is not None else find_lamps(Path(folder), overrides.lights, lamps)
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
-            problem = f"--lights-format {lights_format} concerns light directions, but {near.positions} has positions"
+            problem = f"--light-format {lights_format} concerns light directions, but {near.positions} has positions"
             raise UsageError(problem, hint="Leave it out, or use --light-distance with a file of directions")
         overrides, form = replace(overrides, lights=near.positions), "positions"
     if near is not None and near.object_width is not None and window.box is not None:

@@ -16,9 +16,8 @@ from typing import Any
 
 import typer
 
-from splinecli.capture.record import MIN_LIGHTS
-from splinecli.cli.shared import listed
 from splinecli.errors import SplinecliError, UsageError, printable
+from splinecli.records import listed
 from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer
@@ -27,8 +26,6 @@ DEFECT = "this is a defect of splinecli; please report it with the lines above."
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
-_NUMBERS = {"int": "a whole number", "float": "a number"}
-_LIMITS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
 _SYNTAX = (
     (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
     (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
@@ -38,6 +35,8 @@ _SYNTAX = (
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
 """Click's texts as regular expressions, and the words that replace them."""
+
+RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}  # options of earlier versions
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -90,45 +89,18 @@ def _usage_message(error: Any) -> str:
     """Return the message for a usage error of click: what was found, what was expected, and where help is."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
-    text = _bad_value(error) or _unknown_name(error) or error.format_message()
+    text = _unknown_name(error) or error.format_message()
     for pattern, words in _SYNTAX:
         text = re.sub(pattern, words, text)
     end = "" if text.endswith("?") else "."
     return f"{text.rstrip('.')}{end} See '{where} --help'."
 
 
-def _bad_value(error: Any) -> str | None:
-    details = getattr(error.__cause__, "errors", None)
-    parameter = getattr(error, "param", None)
-    if not callable(details) or not parameter:
-        return None
-    detail = details()[0]
-    option, value, limits = max(parameter.opts, key=len), detail["input"], detail.get("ctx", {})
-    kind = detail["type"].removesuffix("_parsing")
-    if kind in _NUMBERS:
-        return f"{option} is {value!r}; expected {_NUMBERS[kind]}{_range(parameter)}"
-    for limit, words in _LIMITS.items():
-        if limit in limits:
-            return f"{option} is {value}; expected {words} {limits[limit]:g}"
-    choices = re.search(r" is not one of (.+)$", detail["msg"])
-    if choices:
-        return f"{option} is {value!r}; expected one of {choices[1].replace(chr(39), '')}"
-    return None
-
-
-def _range(parameter: Any) -> str:
-    """Return the range of an option in words: " from 1", " from 0 to 1" or ""."""
-    smallest, largest = getattr(parameter, "min", None), getattr(parameter, "max", None)
-    if smallest is None and parameter.name == "n_lights":
-        # The number of lights is checked with the other values of infer, so that --json reports it.
-        smallest = MIN_LIGHTS
-    words = "" if smallest is None else f" from {smallest:g}"
-    return words if largest is None else f"{words} to {largest:.10g}"
-
-
 def _unknown_name(error: Any) -> str | None:
     text = error.format_message()
     option = getattr(error, "option_name", None)
+    if option in RENAMED:
+        return f"{option} is now {RENAMED[option]}."
     if option and hasattr(error, "possibilities"):
         return f"no option {option}.{_suggestion(sorted(error.possibilities or ()))}"
     command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)

@@ -1,106 +1,61 @@
-"""The Typer app, the help of its commands in panels, and the entry point, which turns every error into an exit code.
+"""The Typer app, and the entry point, which turns every error into an exit code.
 
 Importing it must stay cheap: no torch, no OpenCV.
 """
 
-import inspect
 import io
 import json
 import logging
 import os
-import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
-from typer.core import TyperCommand, TyperGroup
-from typer.models import ParameterInfo
+from typer.core import TyperCommand
 
 from splinecli import __version__
-from splinecli.cli.calibrate import calibrate, integrate
+from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
 from splinecli.cli.console import DEFECT, Messages, ParserError, error_document, explain, print_lines, printed_documents
-from splinecli.cli.evaluate import evaluate
 from splinecli.cli.infer import infer, info, watch
-from splinecli.cli.prepare import prepare
+from splinecli.cli.options import command, help_of
 from splinecli.cli.signals import INTERRUPTED, TOLD
-from splinecli.cli.train import import_weights, train
 from splinecli.system.machine import check_address_space, keep_freed_memory
 
-TERM_WIDTH = 30  # columns of the names of options in the help; a longer name has a line of its own
 HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Typer breaks it at 80
-ARGUMENTS = "Arguments"
-
 INFER = "infer"  # the command whose JSON is a list of documents
 JSON, JSON_LINES = "--json", "--jsonl"
 
-_RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
-
-PANELS = {
-    "infer": {
-        "Input": "mask auto-mask crop scale ground-truth transfer ambient flat-field white-level as-stored",
-        "Lights": "lights first-light light-frame lights-format intensities refine-lights light-positions"
-        " light-distance pixel-size object-width camera-matrix n-lights seed light-indices",
-        "Method": "method weights",
-        "Output": "output format maps html surface stiffness convention strict update overwrite json jsonl quiet",
-        "Speed": "distil device precision",
-        "Processes and machines": "workers cluster shard",
-    },
-    "watch": {"Captures": "marker settle"},
-    "info": {
-        "Input": "mask auto-mask crop scale ground-truth transfer ambient flat-field white-level",
-        "Lights": "lights first-light light-frame lights-format intensities light-positions light-distance pixel-size"
-        " object-width camera-matrix check-lights mended-lights",
-        "Output": "plot strict overwrite json quiet",
-    },
-    "calibrate": {
-        "Input": "circle mask ball-diameter camera-matrix",
-        "Light intensities": "gray-ball gray-card transfer",
-        "Output": "output compare overwrite json quiet",
-    },
-    "integrate": {
-        "Input": "mask camera-matrix pixel-size convention colours prior",
-        "Method": "stiffness prior-detail largest-step",
-        "Output": "output format decimate overwrite json quiet",
-    },
-    "evaluate": {
-        "Input": "skip-first max-pixels as-stored white-level",
-        "Lights": "lights n-lights trials seed draws light-noise-deg refine-lights light-error-deg",
-        "Method": "method weights rotations",
-        "Output": "output figures pixel overwrite json quiet",
-        "Speed": "jobs device precision",
-        "Processes and machines": "workers cluster",
-    },
-    "prepare": {
-        "Input": "as-stored update white-level",
-        "Scenes": "scenes mesh views relief size n-lights seed",
-        "Output": "output json quiet",
-        "Speed": "workers",
-    },
-    "train": {
-        "Settings": "preset config param start-from seed",
-        "Pixels": "generator-weight n-lights",
-        "Length": "steps minutes resume",
-        "Output": "output tensorboard quiet",
-        "Speed": "device",
-    },
-    "import-weights": {"Output": "output overwrite quiet"},
+_FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
+    "splinecli.pipeline.infer_options": (infer, watch, info),
+    "splinecli.pipeline.options": (calibrate, integrate, evaluate, prepare, train, import_weights),
 }
-"""Command -> title of a panel -> its options, in the order of the help."""
-
-OTHERS = "Options"  # title of the options that no panel names, such as --help
+COMMANDS = {each.__name__.replace("_", "-"): (each, module) for module, part in _FUNCTIONS.items() for each in part}
+"""Name of a command -> its function, and the module that declares its options."""
 
 
 class Command(TyperCommand):
-    """A command whose help has panels, as plain text, and which expands `~` in its arguments.
+    """A command that expands `~` in its arguments, and makes its options when they are asked for.
 
     With --json, a command that fails prints a document on stdout as well: {"error", "exit_code"}.
     """
+
+    @cached_property
+    def _made(self) -> Any:
+        alone = typer.Typer(add_completion=False)
+        alone.command()(command(*COMMANDS[str(self.name)]))
+        return typer.main.get_command(alone)
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return an attribute. Those that follow from the options are made now, as the options import much."""
+        return getattr(self._made, name) if name in ("params", "callback") else super().__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
@@ -123,15 +78,20 @@ class Command(TyperCommand):
         try:
             check_address_space()
             keep_freed_memory()
-            try:
-                return super().invoke(ctx)
-            except EOFError as error:  # click takes it for an interruption by the user
-                raise RuntimeError("unexpected end of a file") from error
+            if ctx.info_name != INFER:
+                return self._run(ctx)
+            with printed_documents(as_list=ctx.params["as_json"], as_lines=ctx.params["as_json_lines"]) as ctx.obj:
+                return self._run(ctx)
         except Exception as error:
-            # infer prints its list itself, with what it has done until then.
             if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
                 print(json.dumps(error_document(error), indent=2))
             raise
+
+    def _run(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:  # click takes it for an interruption by the user
+            raise RuntimeError("unexpected end of a file") from error
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Return what a word may become, each with a line of help: shells take a second line for another word."""
@@ -144,61 +104,18 @@ class Command(TyperCommand):
         """Return the parts of the usage line, without the braces that Typer sets about arguments."""
         return [piece.translate({ord(brace): None for brace in "{}"}) for piece in super().collect_usage_pieces(ctx)]
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of the arguments, then of the options, panel by panel."""
-        panels = help_panels(self, ctx)
-        longest = min(max(len(term) for rows in panels.values() for term, _ in rows), TERM_WIDTH)
-        for title, rows in panels.items():
-            with formatter.section(title):
-                # All panels have their texts in one column.
-                formatter.write_dl([(term.ljust(longest), meaning) for term, meaning in rows], TERM_WIDTH)
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return the option --help, in the panel of the output."""
+        option: Any = super().get_help_option(ctx)
+        option.rich_help_panel, option.metavar = "Output", ""
+        return option
 
-
-class Group(TyperGroup):
-    """The commands, each with the whole first sentence of its help."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of the commands."""
-        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in commands if command]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
-
-
-def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return the title of each panel of a command's help and its rows: names, and what they mean."""
-    arguments, options = [], {}
-    for parameter in command.get_params(context):
-        record = parameter.get_help_record(context)
-        if record is None:
-            continue
-        term, meaning = record
-        if parameter.param_type_name == "argument":
-            # The record has the Python type beside the name.
-            arguments.append((str(parameter.metavar or parameter.name), _tidy(meaning.removesuffix("[required]"))))
-        else:
-            long_name = max(parameter.opts, key=len)
-            options[long_name] = (term, _tidy(meaning))
-    panels = sort_into_panels(context.info_name, list(options))
-    rows = {title: [options[name] for name in names] for title, names in panels.items()}
-    return {ARGUMENTS: arguments, **rows} if arguments else rows
-
-
-def sort_into_panels(command: str, options: list[str]) -> dict[str, list[str]]:
-    """Return the title of each panel and those of the options (their long names) that stand in it."""
-    panels = {
-        title: [f"--{name}" for name in names.split() if f"--{name}" in options]
-        for title, names in PANELS.get(command, {}).items()
-    }
-    named = {name for names in panels.values() for name in names}
-    panels[OTHERS] = [name for name in options if name not in named]
-    return {title: names for title, names in panels.items() if names}
-
-
-def _tidy(meaning: str) -> str:
-    """Return a help text without the ranges of numbers that click adds ("[x>=1]")."""
-    meaning = re.sub(rf"\s*\[{_RANGE}\]$", "", meaning)
-    return " ".join(re.sub(rf"; {_RANGE}\]$", "]", meaning).split())
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, without the Python types of arguments."""
+        arguments: list[Any] = [parameter for parameter in self.params if parameter.param_type_name == "argument"]
+        for argument in arguments:
+            argument.display_type_rich = lambda ctx: None
+        super().format_help(ctx, formatter)
 
 
 def _expand(value: Any) -> Any:
@@ -212,13 +129,11 @@ def _expand(value: Any) -> Any:
 
 app = typer.Typer(
     name="splinecli",
-    cls=Group,
     help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
-    # Plain text reads the same on a terminal, in a pipe and in the documentation.
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -237,12 +152,8 @@ def _splinecli(
     pass
 
 
-for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
-    # By default, Typer refuses a path without permission. One such capture would then end a batch.
-    for _parameter in inspect.signature(_command).parameters.values():
-        if isinstance(_parameter.default, ParameterInfo):
-            _parameter.default.readable = False
-    app.command(cls=Command)(_command)
+for _name, (_function, _) in COMMANDS.items():
+    app.command(name=_name, help=help_of(_function), cls=Command)(lambda: None)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -252,7 +163,8 @@ def main(args: Sequence[str] | None = None) -> int:
     # takes cores from the thread that computes. PyTorch reads the variable when it is first imported.
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    logging.lastResort = logging.NullHandler()  # logs of libraries are no messages for users
+    logging.disable()  # logs of libraries, such as Dask's, are no messages for users
+    warnings.filterwarnings("ignore", module="distributed")  # other versions on workers; see Work.enter
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)

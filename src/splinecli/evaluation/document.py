@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
+from splinecli.documents import ComparisonReport, ProtocolReport
 from splinecli.errors import printable
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import (
@@ -208,7 +209,6 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-SCHEMA = 1  # Schema version of results.json. It rises when a field changes its meaning.
 _DIGITS = 4  # behind the point, of degrees and seconds
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
@@ -265,7 +265,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     significant digits.
     """
     return {
-        "schema": SCHEMA,
+        "schema": 1,
         "protocol": _protocol_record([evaluation.protocol for evaluation in evaluations]),
         "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
         "results": [
@@ -282,20 +282,22 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
 def _comparisons(evaluation: Evaluation) -> list[dict[str, Any]]:
     return [
-        {
-            "first": c.first,
-            "second": c.second,
-            "capture": c.capture,
-            "n_lights": lights_value(evaluation.protocol),
-            "light_noise_deg": evaluation.protocol.light_noise_deg,
-            "trials": c.trials,
-            "difference_deg": _rounded(c.difference_deg),
-            "std_deg": _rounded(c.std_deg),
-            "interval_deg": None if c.interval_deg is None else [_rounded(end_deg) for end_deg in c.interval_deg],
-            "p_value": _significant(c.p_value),
-            "p_holm": _significant(c.p_holm),
-            "differs": c.differs,
-        }
+        ComparisonReport(
+            first=c.first,
+            second=c.second,
+            capture=c.capture,
+            n_lights=lights_value(evaluation.protocol),
+            light_noise_deg=evaluation.protocol.light_noise_deg,
+            trials=c.trials,
+            difference_deg=round(c.difference_deg, _DIGITS),
+            std_deg=round(c.std_deg, _DIGITS),
+            interval_deg=None
+            if c.interval_deg is None
+            else (round(c.interval_deg[0], _DIGITS), round(c.interval_deg[1], _DIGITS)),
+            p_value=_significant(c.p_value),
+            p_holm=_significant(c.p_holm),
+            differs=c.differs,
+        ).as_dict()
         for c in compare(evaluation)
     ]
 
@@ -320,19 +322,19 @@ def _as_text_cell(value: Any) -> Any:
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
     first = protocols[0]
-    return {
-        "n_lights": _one_or_list([lights_value(protocol) for protocol in protocols]),
-        "trials": first.trials,
-        "seed": first.seed,
-        "draws": None if first.draws_file is None else first.draws_file.name,
-        "light_noise_deg": _one_or_list([protocol.light_noise_deg for protocol in protocols]),
-        "max_pixels": first.max_pixels,
-        "skip_first": dict(first.skip_first),
-        "as_stored": first.as_stored,
-        "white_level": first.white_level,
-        "light_error_deg": first.light_error_deg,
-        "lights_estimated": first.finds_lights,
-    }
+    return ProtocolReport(
+        n_lights=_one_or_list([lights_value(protocol) for protocol in protocols]),
+        trials=first.trials,
+        seed=first.seed,
+        draws=None if first.draws_file is None else first.draws_file.name,
+        light_noise_deg=_one_or_list([protocol.light_noise_deg for protocol in protocols]),
+        max_pixels=first.max_pixels,
+        skip_first=dict(first.skip_first),
+        as_stored=first.as_stored,
+        white_level=first.white_level,
+        light_error_deg=first.light_error_deg,
+        lights_estimated=first.finds_lights,
+    ).as_dict()
 
 
 def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -173,7 +173,7 @@ class Protocol:
         return self.skip_first.get(capture, self.skip_first.get(EVERY_CAPTURE, 0))
 
 
-def lights_value(protocol: Protocol) -> int | str:
+def lights_value(protocol: Protocol) -> int | Literal["all"]:
     """Return the number of lights in each draw, or "all"."""
     return "all" if protocol.n_lights is None else protocol.n_lights
 

@@ -230,7 +230,7 @@ class ShadowCheck:
         normals = self.normals.transformed(matrix)
         if not self.lit.any():
             return Shadows(0.0, 0.0)
-        heights = integrate_normals(normals.normals, normals.mask, stiffness=0)
+        heights = integrate_normals(normals.normals, normals.mask, discontinuity=0)
         cast = cast_shadows(heights, self.lights @ matrix.T)[normals.mask][self.lit]
         dark = self.dark[self.lit]
         common = np.count_nonzero(cast & dark)

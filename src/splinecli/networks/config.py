@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from splinecli.errors import ModelError
 from splinecli.fits.ia14 import solve_ia14
 from splinecli.fits.least_squares import solve_iw12, weighted_least_squares
 from splinecli.maths.observation_map import MAP_SIZE, Grid
+from splinecli.records import settings
 
 HEAD_WIDTH = 16  # channels of an attention head of the set branch
 
@@ -51,8 +53,7 @@ def fit_normals(
     return torch.nn.functional.normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
 
 
-_RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "set_layers": (1, 64)}
-"""Smallest and largest values of settings, of others 1 and 4096. Each layer takes memory, whatever its size."""
+Depth = Annotated[int, Meta(ge=1, le=64)]  # each layer takes memory, whatever its size
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,12 @@ class NetworkConfig:
 
     # "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
     size: Literal["paper", "compact"] = "compact"
-    map_size: int = MAP_SIZE  # cells along a side of the observation map
-    width: int = 64  # channels of the compact size
+    map_size: Annotated[int, Meta(ge=8, le=128, multiple_of=4)] = MAP_SIZE  # cells along a side of the observation map
+    width: Annotated[int, Meta(ge=2, le=4096)] = 64  # channels of the compact size
     # li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size
-    li_blocks: int = 2
-    ne_blocks: int = 3
-    head_width: int = 256  # hidden features of NE-Net's head in the compact size
+    li_blocks: Depth = 2
+    ne_blocks: Depth = 3
+    head_width: Annotated[int, Meta(ge=1, le=4096)] = 256  # hidden features of NE-Net's head in the compact size
     grid: Grid = "even"  # how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
     # the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact size
     # only.
@@ -76,8 +77,8 @@ class NetworkConfig:
     error_head: bool = False  # whether NE-Net also estimates its own error. Compact size only.
     refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
     refines_twice: bool = False  # whether a second refinement net follows the first
-    set_width: int = 0  # channels of the set branch, 0 for none. Compact size only.
-    set_layers: int = 3  # attention layers of the set branch
+    set_width: Annotated[int, Meta(ge=0, le=4096)] = 0  # channels of the set branch, 0 for none. Compact size only.
+    set_layers: Depth = 3  # attention layers of the set branch
     sees_capture: bool = False  # whether pixels see a sample of their capture. Needs a set branch.
 
     @property
@@ -92,32 +93,10 @@ class NetworkConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
         """Rebuild a configuration from plain values. Raises ModelError for an unknown key or value."""
-        known = get_type_hints(cls)
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
-        values = dict(values)
-        fits = values.pop("fits", ())
-        if not isinstance(fits, list | tuple) or not all(isinstance(fit, str) and fit in STARTING_FITS for fit in fits):
-            raise ModelError(f"network setting 'fits' is {fits!r}; expected a list of {', '.join(STARTING_FITS)}")
-        for name, value in values.items():
-            choices = (True, False) if known[name] is bool else get_args(known[name])
-            if choices:
-                if value not in choices:
-                    expected = " or ".join(map(repr, choices))
-                    raise ModelError(f"network {name} is {value!r}; expected {expected}")
-                continue
-            least, most = _RANGES.get(name, (1, 4096))
-            if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-                raise ModelError(
-                    f"network setting {name!r} is {value!r}; expected a whole number from {least} to {most}"
-                )
-        config = cls(**values, fits=tuple(fits))
-        # Both sizes halve the map twice. An instance norm needs more than one cell after that.
-        if config.map_size % 4 or not 8 <= config.map_size <= 128:
-            raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
-        if config.width < 2:
-            raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
+        config = cls(**settings(cls, values, "network setting", ModelError))
+        for fit in config.fits:
+            if fit not in STARTING_FITS:
+                raise ModelError(f"network setting 'fits' has {fit!r}; expected a list of {', '.join(STARTING_FITS)}")
         for name in ("fits", "error_head", "set_width"):
             if getattr(config, name) and config.size != "compact":
                 raise ModelError(f"network setting {name!r} needs the size 'compact'")
@@ -130,5 +109,5 @@ class NetworkConfig:
         if config.set_width % HEAD_WIDTH:
             raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
         if config.grid != "even" and config.size != "paper":
-            raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
+            raise ModelError(f"network setting 'grid' is {config.grid!r}; it needs the size 'paper'")
         return config

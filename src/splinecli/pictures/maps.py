@@ -46,7 +46,6 @@ def encode_png(
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0
 
 TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
 

@@ -7,14 +7,13 @@ skipped. The error of one that fails is kept.
 from __future__ import annotations
 
 import os
-import re
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from splinecli import __version__
 from splinecli.capture import capture_name
@@ -22,40 +21,24 @@ from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.methods import Estimator, MethodOptions, method_names
-from splinecli.output_files import MAPS, NORMALS, REPORT, SCALED_MAPS, own_files
-from splinecli.pipeline.distribution import SAME_STORAGE, ClusterOptions, Item, LostError, distributor, this_worker
+from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
+from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import held_results, infer_capture, inputs_sha256, make_method
-from splinecli.pipeline.infer_options import BASE_BYTES, InferOptions, source_bytes
+from splinecli.pipeline.infer import (
+    BASE_BYTES,
+    held_results,
+    infer_capture,
+    inputs_sha256,
+    make_method,
+    source_bytes,
+)
+from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import NoRoomError, as_splinecli_error, check_writable, find_mode, resolve, write_text
 from splinecli.system.machine import available_memory, choose_device, count_available_cores, is_out_of_memory
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, is_plain
-
-_SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
-
-
-class Shard(NamedTuple):
-    """Part `number` of a batch of `n_parts`, counted from 1."""
-
-    number: int
-    n_parts: int
-
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Return the shard of "3/8". Raises UsageError."""
-        found = _SHARD.fullmatch(text)
-        if found is None:
-            raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
-        number, count = int(found[1]), int(found[2])
-        if not 1 <= number <= count:
-            raise UsageError(
-                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
-                hint="If your job numbers count from 0, add 1",
-            )
-        return cls(number, count)
 
 
 @dataclass(frozen=True)
@@ -121,8 +104,6 @@ def _member(folder: Path) -> Member:
     kind = "film" if is_film(folder) else "folder"
     return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
 
-
-Redo = Literal["nothing", "changed", "all"]  # of the captures that have results
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
@@ -194,10 +175,6 @@ def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status 
     return Outcome(status, document, error.exit_code, trace)
 
 
-_OPTIONS = {"formats": "format", **dict.fromkeys((f"{name}_scale" for name in SCALED_MAPS), "maps")}
-"""The options of `infer` whose fields in InferOptions have other names."""
-
-
 class ChangedError(OutputError):
     """A folder has results of other input files, other options or another version."""
 
@@ -240,13 +217,7 @@ def find_earlier(
         raise ChangedError("by another version", target) from None
     if version != __version__:
         raise ChangedError(f"by version {version}", target)
-    if earlier != options:
-        changed = [
-            option.name
-            for option in fields(options)
-            if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
-        ]
-        names = list(dict.fromkeys(f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in changed))
+    if names := options.changes(earlier):
         differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
         raise ChangedError(f"with {differences}", target)
     if stamp != inputs_sha256(options.open(folder), options.weights):
@@ -261,7 +232,7 @@ def infer_batch(
     *,
     redo: Redo = "nothing",
     shard: Shard | None = None,
-    cluster: ClusterOptions | None = None,
+    cluster: ClusterOptions = HERE,
 ) -> Iterator[Outcome]:
     """Run `infer_capture` on each folder and yield its outcome, in order, or on other processes as they end.
 
@@ -270,8 +241,8 @@ def infer_batch(
     Args:
         folders: the captures. A folder that is given twice counts once.
         redo: which captures that have results are computed again.
-        cluster: the processes or machines that compute; None for this process. A number of workers of 0 means as many
-            as the machine's cores and memory allow.
+        cluster: the processes or machines that compute. A number of workers of 0 means as many as the machine's cores
+            and memory allow.
 
     Raises:
         UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
@@ -289,16 +260,15 @@ def infer_batch(
     if with_index:
         check_index_free(output, overwrite=redo == "all")
     entries: dict[int, Entry] = {}
-    if cluster is not None and cluster.address is None:
-        if not cluster.workers:
-            cluster = replace(cluster, workers=choose_workers(members, options))
-        cluster = cluster.on_cores(len(members))
+    if cluster.address is None and not cluster.workers:
+        cluster = cluster.replace(workers=choose_workers(members, options))
+    elsewhere = cluster.on_cores(len(members))
     outcomes: Iterable[tuple[int, Outcome]]
-    if cluster is None:
+    if elsewhere is None:
         method = cache(partial(make_method, options))
         outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
     else:
-        outcomes = _on_workers(members, options, observer, redo, cluster)
+        outcomes = _on_workers(members, options, observer, redo, elsewhere)
     for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
@@ -315,7 +285,7 @@ def _on_workers(
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it ends on another process."""
     # On any device: the machine of the command may have none of the workers' GPUs.
-    weights = make_method(replace(options, device="cpu") if cluster.address else options).weights
+    weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
         Item((number, member), str(member.folder), expected_bytes(member, options))

@@ -1,9 +1,6 @@
 """What `calibrate` does: images of balls and of a gray target in, light files and a report out."""
 
 import json
-import math
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
@@ -11,10 +8,10 @@ from splinecli.calibration.circle import Circle
 from splinecli.calibration.lamps import calibration_report, measure_light_intensities, summary_lines, triangulate_lamps
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
-from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.output_files import CALIBRATION
 from splinecli.pictures.plots import calibration_picture
+from splinecli.pipeline.options import CalibrateOptions
 from splinecli.system.files import check_free
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
@@ -23,46 +20,6 @@ DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = CALIBRATION, "calibration.json"
 OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalibrateOptions:
-    """The options of `calibrate`, as its help describes them; None is the default in the help. Raises UsageError."""
-
-    balls: tuple[Path, ...]
-    circles: tuple[Circle, ...] = ()
-    masks: tuple[Path, ...] = ()
-    ball_diameter: float | None = None
-    camera_matrix: Path | None = None
-    gray_ball: Path | None = None
-    gray_card: Path | None = None
-    transfer: str = AUTOMATIC
-    compare: Path | None = None
-    output: Path = Path("calibration")
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
-            raise UsageError(
-                "--transfer needs --gray-ball or --gray-card",
-                hint="Leave it out: the light directions do not depend on the curve",
-            )
-        if self.ball_diameter is not None and not 0 < self.ball_diameter < math.inf:
-            raise UsageError(f"the ball diameter is {self.ball_diameter:g}, expected a number above 0")
-        if self.ball_diameter is not None and len(self.balls) < 2:
-            raise UsageError(
-                "--ball-diameter needs two balls or more",
-                hint="Photograph a second ball, or the same ball at another place: one ball gives no positions",
-            )
-        if self.gray_ball and self.gray_card:
-            raise UsageError("--gray-ball and --gray-card contradict each other", hint="Leave one out")
-        for option, values in (("--circle", self.circles), ("--mask", self.masks)):
-            if values and len(values) != len(self.balls):
-                times = "once" if len(values) == 1 else f"{len(values)} times"
-                raise UsageError(
-                    f"{option} is given {times} for {len(self.balls)} balls",
-                    hint="Give it once for each ball, in the same order",
-                )
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -86,7 +43,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
         for folder, mask in zip(options.balls, options.masks or [None] * len(options.balls), strict=True)
     ]
     known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
-    circles = options.circles or [None] * len(balls)
+    circles = [Circle(*numbers) for numbers in options.circles] if options.circles else [None] * len(balls)
     with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
         calibrated = [
             calibrate_ball(ball, circle=circle, camera_matrix=options.camera_matrix, progress=lambda: advance(1))

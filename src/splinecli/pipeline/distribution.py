@@ -11,13 +11,11 @@ import math
 import os
 import time
 import uuid
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import metadata
-from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock
@@ -25,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.system.files import UNFINISHED, made_folder, read_json, refusals_as_output_errors
 from splinecli.system.machine import available_memory, count_available_cores, import_extra, keep_freed_memory
 from splinecli.system.progress import Observer
@@ -54,27 +53,6 @@ _QUIET = {
 """Settings of Dask without what serves its dashboard only. It would take processor time, and memory for an hour."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClusterOptions:
-    """Where items are done."""
-
-    workers: int = 1  # the number of processes of this machine, if there is no `address`. 0 for as many as it can use.
-    address: str | None = None  # the address of a Dask scheduler, or its scheduler file
-    gpu: bool = False  # whether only workers with the Dask resource GPU are used
-
-    def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
-        """Return these options with a process for each core in place of 0, and at most one for each item.
-
-        Return None where this process can do the items as well.
-        """
-        if self.address is not None:
-            return self
-        workers = self.workers or count_available_cores()
-        if n_items is not None:
-            workers = min(workers, n_items)
-        return None if workers < 2 else replace(self, workers=workers)
-
-
 @contextmanager
 def connected(options: ClusterOptions) -> Iterator[Client]:
     """Yield a Dask client: of a new cluster of this machine's processes, or of a running one.
@@ -82,9 +60,6 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
     Raises UsageError if Dask is not installed, or there is no scheduler at the address.
     """
     distributed = import_extra("distributed", "cluster")
-    for name in _LOGGERS:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", category=distributed.versions.VersionMismatchWarning)
     if options.address is None:
         with _local_cluster(options) as cluster, distributed.Client(cluster, set_as_default=False) as client:
             yield client
@@ -141,7 +116,6 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives it up.
         "distributed.deploy.lost-worker-timeout": "1 h",
     }
-    _start_resource_tracker()
     with dask.config.set(settings):
         try:
             cluster = LocalCluster(
@@ -166,18 +140,6 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             yield cluster
         finally:
             cluster.close(timeout=_CLOSE_SECONDS)
-
-
-def _start_resource_tracker() -> None:
-    """Start the process in which Python counts semaphores, without its warning: SIGTERM may end this process first."""
-    if os.name == "nt":  # where there is no such process
-        return
-    before = os.environ.get("PYTHONWARNINGS", "")
-    os.environ["PYTHONWARNINGS"] = "ignore"
-    try:
-        resource_tracker.ensure_running()
-    finally:
-        os.environ["PYTHONWARNINGS"] = before
 
 
 def _address(text: str) -> str:

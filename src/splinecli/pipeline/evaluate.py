@@ -5,129 +5,26 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splinecli.capture import find_captures, open_capture
-from splinecli.capture.record import ESTIMATE
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.document import TRIALS, write_results
-from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
+from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems
 from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
 from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
-from splinecli.lights.light_fit import LIGHT_ERROR_DEG, check_light_error
-from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
-from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
-from splinecli.pipeline.infer_options import source_bytes
-from splinecli.restoration.images import check_white_level
+from splinecli.methods import Estimator, MethodOptions, make_estimator
+from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.infer import source_bytes
+from splinecli.pipeline.infer_options import ClusterOptions
+from splinecli.pipeline.options import EvaluateOptions
 from splinecli.system.files import check_writable
 from splinecli.system.machine import count_available_cores
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
-
-DEFAULT_TRIALS = 100
-TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
-DEFAULT_LIGHTS = 10
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """The options of `evaluate`, as its help describes them.
-
-    Raises UsageError if a value is out of its range, or two options contradict each other.
-
-    Args:
-        methods: a name that comes twice counts once.
-        n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
-            number in the draws file.
-        light_noise_deg: one evaluation for each.
-        trials: None for DEFAULT_TRIALS, or for TRIALS_OF_MANY of MANY_METHODS or more. jobs: None for the cores, or for
-            1 on a GPU.
-        pixels: (row, column) of each.
-        cluster: the processes or machines that score trials; None for this process.
-    """
-
-    methods: tuple[str, ...] = (DEFAULT_METHOD,)
-    method_options: MethodOptions = field(default_factory=MethodOptions)
-    n_lights: tuple[int | None, ...] = ()
-    light_noise_deg: tuple[float, ...] = (0.0,)
-    trials: int | None = None
-    seed: int = 0
-    draws: str | None = None
-    max_pixels: int | None = None
-    skip_first: dict[str, int] = field(default_factory=dict)
-    as_stored: bool = False
-    lights: str | None = None
-    refine_lights: bool = False
-    light_error_deg: float | None = None
-    white_level: float | None = None
-    jobs: int | None = None
-    figures: bool = False
-    pixels: tuple[tuple[int, int], ...] = ()
-    output: str = "evaluation"
-    overwrite: bool = False
-    cluster: ClusterOptions | None = None
-
-    def __post_init__(self) -> None:
-        check_white_level(self.white_level)
-        if self.draws is not None and self.n_lights:
-            raise UsageError(
-                "--draws and --n-lights contradict each other",
-                hint="Leave --n-lights out: the draws determine the number of lights",
-            )
-        if self.draws is not None and self.trials is not None:
-            raise UsageError(
-                "--draws and --trials contradict each other",
-                hint="Leave --trials out: each line of the draws is a trial",
-            )
-        check_light_error(self.light_error_deg, refines=self.refine_lights)
-        if self.lights not in (None, ESTIMATE):
-            raise UsageError(
-                f"--lights is {self.lights}; expected {ESTIMATE}", hint="Without it, the captures' light files count"
-            )
-        if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
-            raise UsageError(
-                "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
-                hint="Leave these out",
-            )
-        if self.cluster is not None and self.jobs is not None:
-            raise UsageError(
-                "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
-            )
-        for name in self.methods:
-            check_method(name)
-        if self.pixels and not (self.figures and any(map(has_observation_maps, self.methods))):
-            raise UsageError(
-                "--pixel chooses the observation maps that --figures shows",
-                hint="Add --figures and --method spline-net",
-            )
-        _ = self.protocols
-
-    @property
-    def protocols(self) -> list[Protocol]:
-        """One protocol for each number of lights and each light noise. Raises UsageError."""
-        usual = TRIALS_OF_MANY if len(set(self.methods)) >= MANY_METHODS else DEFAULT_TRIALS
-        counts = self.n_lights or ((DEFAULT_LIGHTS,) if self.draws is None else (None,))
-        return [
-            Protocol(
-                count,
-                usual if self.trials is None else self.trials,
-                self.seed,
-                None if self.draws is None else Path(self.draws),
-                noise,
-                self.max_pixels,
-                self.skip_first,
-                self.as_stored,
-                self.white_level,
-                (self.light_error_deg or LIGHT_ERROR_DEG) if self.refine_lights else None,
-                self.lights is not None,
-            )
-            for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
-        ]
 
 
 class EvaluateOutcome(NamedTuple):
@@ -139,13 +36,10 @@ class EvaluateOutcome(NamedTuple):
     figure_problems: list[str]
 
 
-def evaluate_captures(
-    datasets: Sequence[Path], options: EvaluateOptions, observer: Observer = SILENT
-) -> EvaluateOutcome:
+def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> EvaluateOutcome:
     """Score the methods on the captures, and write the results to the output folder.
 
-    All options are checked before the first image is read. `datasets` are folders of captures with ground truth, or
-    such captures.
+    All options are checked before the first image is read.
 
     Raises:
         UsageError: an option does not fit the captures or the methods.
@@ -153,17 +47,17 @@ def evaluate_captures(
         ModelError: weights cannot be used.
         OutputError: the output folder cannot be written.
     """
-    captures = [capture for dataset in datasets for capture in find_captures(dataset)]
+    captures = [capture for dataset in options.datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
     check_writable(output)
     _check_counts(captures, protocols)
-    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
+    estimators = [make_estimator(name, options.method_options) for name in options.names]
     if options.method_options.weights is not None and not any(estimator.weights for estimator in estimators):
         names = ", ".join(estimator.name for estimator in estimators)
         raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
-    if cluster := options.cluster and options.cluster.on_cores():
+    if cluster := options.cluster.on_cores():
         elsewhere = partial(_score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:

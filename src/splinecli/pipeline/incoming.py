@@ -7,13 +7,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from splinecli.capture.files import digest, natural_key, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.pictures.maps import encode_png
-from splinecli.pipeline.infer_options import Reading
+from splinecli.pipeline.infer_options import Reading, Redo
 from splinecli.system.files import read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
@@ -23,9 +22,7 @@ _RECORD = "film.json"
 _FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
-def unpacked(
-    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Literal["nothing", "changed", "all"]
-) -> Path:
+def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo) -> Path:
     """Return the capture; of a film, the folder of its frames in `output`, which are taken now or were earlier.
 
     Args:

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, capture_name
 from splinecli.capture.files import digest
+from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
-from splinecli.capture.source import BYTES_OF_RESULTS
+from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
 from splinecli.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
-from splinecli.errors import OutputError, UsageError
+from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
 from splinecli.inference import NormalEstimate, estimate_normals, find_surface, light_on
 from splinecli.lights.light_fit import refine_capture
@@ -46,6 +47,40 @@ from splinecli.system.publishing import Content, held_folder, refuse_link
 
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
+
+
+BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
+
+INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
+_WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
+
+
+def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
+    """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
+
+    They follow from the size of the largest image, and the numbers of pixels in the mask and of images that are read.
+    """
+    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    return capture_bytes(largest, n_pixels, n_lights) + of_pixels
+
+
+def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
+    """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
+
+    A capture that cannot be read takes none: it will fail soon. `n_lights` images are read, or all for 0.
+    """
+    try:
+        source = open_source()
+        size = source.facts[0].size
+        n_lights = n_lights or source.n_lights
+        n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
+        n_bytes = infer_bytes(size, n_pixels, n_lights)
+        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
+            n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
+    except (SplinecliError, OSError, MemoryError):
+        return 0.0
+    return float(n_bytes)
 
 
 AUTOMATIC_FROM = 100_000
@@ -324,7 +359,7 @@ def _make_files(
                 capture.mask,
                 camera_matrix,
                 colours,
-                stiffness=options.stiffness,
+                discontinuity=options.discontinuity,
                 pixel_size_mm=pixel_size,
                 progress=advance,
             )

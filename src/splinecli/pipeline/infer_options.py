@@ -1,107 +1,203 @@
-"""The options of `infer`, a frozen record that can be written as JSON and pickled, and the memory that they need."""
+"""The options of `infer`, `watch` and `info`: frozen records that can be written as JSON and pickled."""
 
+# Options are a table: name, type, panel and kind of value, then what they mean.
+# fmt: off
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+import json
+import re
 from functools import partial
-from math import inf, isfinite
+from importlib import resources
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-import numpy as np
+from msgspec import Meta
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.files import MAPS, NORMALS, SCALED_MAPS, check_not_empty, list_images
-from splinecli.capture.formats.facts import StoredSize
-from splinecli.capture.light_rows import LightForm, parse_light_frame
+from splinecli.capture.files import check_not_empty, list_images
+from splinecli.capture.formats.numbers import to_number
+from splinecli.capture.light_files import light_suffixes
+from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import ESTIMATE, LightFinder, azimuth_of, check_light_indices
-from splinecli.capture.source import capture_bytes
-from splinecli.errors import SplinecliError, UsageError, check_one_of
-from splinecli.evaluation.protocol import check_draw_settings
+from splinecli.capture.record import ESTIMATE, MIN_LIGHTS, SIDES_DEG, LightFinder, azimuth_of, check_light_indices
+from splinecli.errors import UsageError
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
-from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
-from splinecli.pipeline.integrate import check_pixel_size
-from splinecli.restoration.images import check_white_level
-from splinecli.surface.bilateral_equations import STIFFNESS
+from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
+from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
+from splinecli.records import (
+    FileName,
+    NotNegative,
+    Option,
+    Positive,
+    Record,
+    Seed,
+    complete_list,
+    field_types,
+    listed,
+    long_name,
+    option_of,
+)
+from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file
-from splinecli.system.machine import Device, Precision
+from splinecli.system.machine import Device, Precision, count_available_cores
 
-BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
-REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
+Redo = Literal["nothing", "changed", "all"]
+SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
-INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
-_WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
-
-
-def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
-
-    They follow from the size of the largest image, and the numbers of pixels in the mask and of images that are read.
-    """
-    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
-    return capture_bytes(largest, n_pixels, n_lights) + of_pixels
+# Options that several commands have.
 
 
-def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
-    """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
-
-    A capture that cannot be read takes none: it will fail soon. `n_lights` images are read, or all for 0.
-    """
-    try:
-        source = open_source()
-        size = source.facts[0].size
-        n_lights = n_lights or source.n_lights
-        n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
-        n_bytes = infer_bytes(size, n_pixels, n_lights)
-        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
-            n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
-    except (SplinecliError, OSError, MemoryError):
-        return 0.0
-    return float(n_bytes)
+def complete_weights() -> list[str]:
+    """Return the names of the shipped weights. If none begins with the typed text, the shell completes file names."""
+    # The module that reads this file imports torch, which takes too long for a completion.
+    return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reading:
+CURVES = ("auto", "linear", "srgb", "gamma:2.2")  # the last is an example
+OUTPUT = ("--output", "-o")
+MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
+DISCONTINUITY_HELP = "Discontinuity sensitivity of the surface; 0 gives a continuous surface."
+
+AsStored = Annotated[bool, Option("Input", "",
+    "Use the stored values: do not remove lens blur, restore saturated pixels or estimate light intensities.")]
+WhiteLevel = Annotated[Positive | None, Option("Input", "N", "Stored value from which a pixel counts as saturated.",
+    default="found in the images")]
+RandomSeed = Annotated[Seed, Option("Lights", "S", "Seed of the random draws.")]
+RefineLights = Annotated[bool, Option("Lights", "",
+    "Refine rough light directions so that they fit the images better.")]
+Weights = Annotated[str | None, Option("Method", "NAME|FILE", "Weights: a shipped name or a file.",
+    default="those of the method", complete=complete_weights)]
+DeviceName = Annotated[Device, Option("Speed", "",
+    "Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")]
+PrecisionName = Annotated[Precision, Option("Speed", "",
+    "Number format. auto is bfloat16 if the hardware supports it, else float32.")]
+Quiet = Annotated[bool, Option("Output", "", "Print nothing but errors.", names=("--quiet", "-q"))]
+Overwrite = Annotated[bool, Option("Output", "", "Replace earlier results.")]
+Update = Annotated[bool, Option("Output", "", "Compute changed captures again, and skip those that are done.")]
+
+
+class Display(Record, frozen=True, kw_only=True):
+    """What a command prints."""
+
+    as_json: Annotated[bool, Option("Output", "", "Print one JSON document on stdout, and nothing else.",
+        names=("--json",))] = False
+    quiet: Quiet = False
+
+
+def parse_workers(text: str) -> int:
+    """Return a number of processes, 0 for "auto". Raises UsageError."""
+    if text != "auto" and (not text.isdecimal() or len(text) > 4 or int(text) < 1):
+        raise UsageError(f"--workers is {text!r}; expected a number from 1, or auto")
+    return 0 if text == "auto" else int(text)
+
+
+class Workers(Record, frozen=True, kw_only=True):
+    """The processes of this machine that do the items of a command; 0 for as many as it can use."""
+
+    workers: Annotated[int, Option("Processes and machines", "N|auto",
+        "Number of processes of this machine that work side by side (needs the extra 'cluster'). auto chooses by cores"
+        " and memory.", parse=parse_workers)] = 1
+
+
+class ClusterOptions(Workers, frozen=True, kw_only=True):
+    """Where the items of a command are done: in this process, others of this machine, or a Dask cluster."""
+
+    # the address of a Dask scheduler, or its scheduler file
+    address: Annotated[str | None, Option("Processes and machines", "ADDRESS|FILE",
+        "Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file (needs"
+        " the extra 'cluster').", names=("--cluster",))] = None
+    gpu: bool = False  # whether only workers with the Dask resource GPU are used
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.address is not None and self.workers != 1:
+            raise UsageError(
+                "--workers and --cluster contradict each other", hint="Leave --workers out: the cluster has its workers"
+            )
+
+    def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
+        """Return these options with a process for each core in place of 0, and at most one for each item.
+
+        Return None where this process can do the items as well.
+        """
+        if self.address is not None:
+            return self
+        workers = self.workers or count_available_cores()
+        if n_items is not None:
+            workers = min(workers, n_items)
+        return None if workers < 2 else self.replace(workers=workers)
+
+
+HERE = ClusterOptions()
+
+
+class Reading(Record, frozen=True, kw_only=True):
     """Which files make a capture, and how they are read: options of `infer` and `info`, as their help describes them.
 
     None is the default in the help. Raises UsageError.
     """
 
-    lights: str | None = None
-    first_light: str | None = None
-    intensities: str | None = None
-    light_positions: str | None = None
-    light_distance: float | None = None
-    pixel_size: float | None = None
-    object_width: float | None = None
-    camera_matrix: str | None = None
-    mask: str | None = None
-    crop: str | None = None
-    scale: str | None = None
-    ground_truth: str | None = None
-    light_frame: str | None = None
-    lights_format: LightForm = "xyz"
-    transfer: str = AUTOMATIC
-    ambient: str | None = None
-    flat_field: str | None = None
-    white_level: float | None = None
-    strict: bool = False
+    mask: Annotated[FileName | None, Option("Input", "FILE",
+        MASK_IMAGE.format("object"), default="a file named mask.*, or all pixels")] = None
+    crop: Annotated[str | None, Option("Input", "X,Y,W,H",
+        "Read this box of the images: left upper corner and size in pixels.")] = None
+    scale: Annotated[str | None, Option("Input", "1/N", "Read every N-th row and column, for a first look.",
+        default="all")] = None
+    ground_truth: Annotated[FileName | None, Option("Input", "FILE",
+        "True normals to compare with (.mat, .npy, text, PNG, TIFF).")] = None
+    transfer: Annotated[str, Option("Input", "CURVE",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads files as they say; JPEG as sRGB.",
+        complete=CURVES)] = AUTOMATIC
+    ambient: Annotated[FileName | None, Option("Input", "FILE",
+        "Image taken without the lights, to subtract from all images.", default="ambient.*")] = None
+    flat_field: Annotated[FileName | None, Option("Input", "DIR",
+        "Folder with images of an evenly white surface: one for all lights, or one for each light.")] = None
+    white_level: WhiteLevel = None
+    lights: Annotated[FileName | None, Option("Lights", "FILE|estimate",
+        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate derives them from the"
+        " images, with lower accuracy.", default="the light file in CAPTURE")] = None
+    first_light: Annotated[str | None, Option("Lights", "SIDE|DEGREES",
+        "With --lights estimate: the side that the first light comes from, such as left, above or upper-left, or its"
+        " azimuth, counter-clockwise from the right. Needed if the images show no outline of the object.",
+        complete=tuple(SIDES_DEG))] = None
+    light_frame: Annotated[str | None, Option("Lights", "LIST",
+        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y stands before x).",
+        default="x right, y up, z to the camera",
+        complete=complete_list(("x-left", "y-down", "z-away", EXCHANGED)))] = None
+    light_format: Annotated[LightForm, Option("Lights", "",
+        "Numbers of a light in a text file: a vector x y z; azel, azimuth and elevation; or slant-tilt, the"
+        " angles of HALCON. Angles are in degrees.")] = "xyz"
+    intensities: Annotated[FileName | None, Option("Lights", "FILE|equal",
+        "Light intensities: a line r g b for each image.",
+        default="equal, or estimated if the images show that they differ")] = None
+    light_positions: Annotated[FileName | None, Option("Lights", "FILE",
+        "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
+        default="light_positions.txt in CAPTURE")] = None
+    light_distance: Annotated[Positive | None, Option("Lights", "D",
+        "Near lamps: the distance of all lamps from the middle of the object.")] = None
+    pixel_size: Annotated[Positive | None, Option("Lights", "S", "Near lamps: the width of a pixel on the object.",
+        default="pixel_size.txt in CAPTURE")] = None
+    object_width: Annotated[Positive | None, Option("Lights", "W",
+        "Near lamps: the width of the object in its mask, in place of --pixel-size.")] = None
+    camera_matrix: Annotated[FileName | None, Option("Lights", "FILE",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is then estimated in the"
+        " frame of its viewing ray.", default="camera_matrix.txt in CAPTURE, or orthographic")] = None
+    strict: Annotated[bool, Option("Output", "",
+        "Fail (exit code 3) where a warning says that the lights or the images are probably wrong.")] = False
     surface = False  # is made of the capture, too, in the unit of pixel_size; a field of InferOptions
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         # These concern a light file or near lamps.
         reasons = {
             "--light-positions": self.light_positions is not None and "finds distant lights",
             "--light-distance": self.light_distance is not None and "finds distant lights",
             "--light-frame": self.light_frame is not None and "needs no light file",
-            "--lights-format": self.lights_format != "xyz" and "needs no light file",
+            "--light-format": self.light_format != "xyz" and "needs no light file",
         }
         for option, reason in reasons.items():
             if self.finds_lights and reason:
@@ -115,9 +211,9 @@ class Reading:
             azimuth_of(self.first_light)
         _ = self.lamps, parse_window(self.crop, self.scale)
         parse_transfer(self.transfer)
+        if "exchanged" in (self.light_frame or ""):  # its name in earlier versions
+            raise UsageError(f"--light-frame is {self.light_frame!r}; exchanged is now {EXCHANGED}")
         parse_light_frame(self.light_frame)
-        check_white_level(self.white_level)
-        check_one_of("light format", self.lights_format, get_args(LightForm))
 
     @property
     def finds_lights(self) -> bool:
@@ -177,47 +273,59 @@ class Reading:
             radiometry=self.radiometric_calibration(),
             white_level=self.white_level,
             light_frame=parse_light_frame(self.light_frame),
-            lights_format=self.lights_format,
+            lights_format=self.light_format,
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
             find_lights=find,
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class InferOptions(Reading):
-    """The options of `infer`, as its help describes them.
+_SCALE = {f"{name}_scale": "--maps" for name in SCALED_MAPS}  # fields that come with the names of the maps
 
-    Two records are equal if they give the same results. `output` and `device` do not count. Raises UsageError if a
-    value is unknown, or two options contradict each other.
 
-    Args:
-        n_lights: None for all. light_indices: counted from 0.
-        distil: False for the method on every pixel, None for distillation of large captures only.
-        formats, maps: names of `splinecli.capture.files.NORMALS` and MAPS.
-        curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
-    """
+class InferOptions(Reading, frozen=True, kw_only=True):
+    """The options of `infer`, as its help describes them. Raises UsageError if a value is wrong or two contradict."""
 
-    refine_lights: bool = False
-    auto_mask: bool = False
-    as_stored: bool = False
-    n_lights: int | None = None
-    seed: int = 0
-    light_indices: tuple[int, ...] | None = None
-    method: str = DEFAULT_METHOD
-    weights: str | None = None
-    distil: bool | None = None
-    device: Device = field(default="auto", compare=False)
-    precision: Precision = "auto"
-    output: str = field(default="out", compare=False)
-    formats: tuple[str, ...] = ("png", "npy")
-    maps: tuple[str, ...] = ()
-    curvature_scale: float = CURVATURE_SCALE
-    relief_scale: float = RELIEF_SCALE
-    html: bool = False
-    surface: bool = False
-    stiffness: float = STIFFNESS
-    convention: Convention = "opengl"
+    # The defaults follow; light_indices count from 0, and the scales are the values that are white in the pictures.
+    auto_mask: Annotated[bool, Option("Input", "",
+        "If there is no mask, find the object in the images and write found_mask.png.")] = False
+    as_stored: AsStored = False
+    refine_lights: RefineLights = False
+    pixel_size: Annotated[Positive | None, Option("Lights", "S",
+        "Near lamps: the width of a pixel on the object, in the unit of the lamps. With --surface: in millimetres, for"
+        " a surface in millimetres.", default="pixel_size.txt in CAPTURE")] = None
+    n_lights: Annotated[Annotated[int, Meta(ge=MIN_LIGHTS)] | None, Option("Lights", "K",
+        "Use K lights drawn at random.", default="all")] = None
+    seed: RandomSeed = 0
+    light_indices: Annotated[tuple[int, ...] | None, Option("Lights", "I,J,...",
+        "Use these lights, counted from 0. Plots and warnings count from 1.",
+        parse=partial(parse_indices, option="--light-indices"))] = None
+    method: Annotated[str, Option("Method", "METHOD",
+        f"Method to use: {listed(method_names())}.", complete=method_names())] = DEFAULT_METHOD
+    weights: Weights = None
+    distil: Annotated[bool | None, Option("Speed", "",
+        "Approximate the network by a smaller one, trained on a sample of the capture's pixels, or use the method on"
+        " every pixel.", default="--distil from 100,000 pixels, else --exact", names=("--distil/--exact",))] = None
+    device: DeviceName = "auto"
+    precision: PrecisionName = "auto"
+    output: Annotated[FileName, Option("Output", "OUT", "Write results to OUT/<capture name>/.", names=OUTPUT)] = "out"
+    formats: Annotated[tuple[str, ...], Option("Output", "LIST",
+        f"Files of the normal map: any of {listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are float32."
+        " With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
+        items=NORMALS)] = ("png", "npy")
+    maps: Annotated[tuple[str, ...], Option("Output", "LIST",
+        f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
+        " pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.", items=MAPS)] = ()
+    curvature_scale: Positive = CURVATURE_SCALE
+    relief_scale: Positive = RELIEF_SCALE
+    html: Annotated[bool, Option("Output", "",
+        "Also write page.html for interactive relighting, with all maps.")] = False
+    surface: Annotated[bool, Option("Output", "",
+        "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.")] = False
+    discontinuity: Annotated[NotNegative, Option("Output", "K",
+        DISCONTINUITY_HELP)] = DISCONTINUITY
+    convention: Annotated[Convention, Option("Output", "",
+        "Green channel of the PNG files: opengl is y up, directx is y down.")] = "opengl"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -228,36 +336,35 @@ class InferOptions(Reading):
         if self.finds_lights and self.refine_lights:
             raise UsageError("--lights estimate refines the lights that it finds", hint="Leave --refine-lights out")
         check_method(self.method)
-        check_pixel_size(self.pixel_size if self.surface else None)
-        if not (isfinite(self.stiffness) and self.stiffness >= 0):
-            raise UsageError(f"the stiffness is {self.stiffness:g}, expected a number of at least 0")
-        if self.n_lights is not None:
-            check_draw_settings(self.n_lights, 1, self.seed)
+        if self.surface and self.pixel_size is not None:
+            check_pixel_size(self.pixel_size)
         if self.light_indices is not None:
             check_light_indices(self.light_indices, max(self.light_indices, default=0) + 1)
-        check_one_of("precision", self.precision, get_args(Precision))
-        check_one_of("device", self.device, get_args(Device))
-        check_one_of("convention", self.convention, get_args(Convention))
-        for name in self.formats:
-            check_one_of("format", name, NORMALS)
-        for name in self.maps:
-            check_one_of("map", name, MAPS)
-        for name in SCALED_MAPS:
-            scale = getattr(self, f"{name}_scale")
-            if not 0 < scale < inf:
-                raise UsageError(f"the scale of the map {name} is {scale:g}, expected a number above 0")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the options as JSON values."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> InferOptions:
-        """Return the options that `as_dict` wrote. Raises TypeError for an unknown name, UsageError as above."""
-        given: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
-        }
-        return cls(**given)
+    def from_arguments(cls, given: dict[str, Any]) -> Self:
+        """See Record. --maps also gives scales, and the seed counts only for lights that are drawn."""
+        scales, names = {}, []
+        for item in (given["maps"] or "").split(","):
+            name, colon, scale = (part.strip() for part in item.partition(":"))
+            names.append(name)
+            if colon:
+                if name not in SCALED_MAPS or to_number(scale) is None:
+                    expected = " or ".join(f"{name}:NUMBER" for name in SCALED_MAPS)
+                    raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
+                scales[f"{name}_scale"] = float(scale)
+        if given["maps"] is not None:
+            given["maps"] = ",".join(names)
+        if given["n_lights"] is None:
+            given["seed"] = None
+        return super().from_arguments(given).replace(**scales)
+
+    def changes(self, earlier: InferOptions) -> list[str]:
+        """Return the options that give other results than earlier ones; --output and --device do not."""
+        kinds = {name: kind for name, kind in field_types(type(self)).items() if name not in ("output", "device")}
+        names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
+        options = {name: option_of(kinds[name]) for name in names}
+        return list(dict.fromkeys(long_name(name, of) if of else _SCALE[name] for name, of in options.items()))
 
     @property
     def method_options(self) -> MethodOptions:
@@ -268,3 +375,93 @@ class InferOptions(Reading):
         """See Reading. Raise UsageError, too, if a package that the options need is not installed."""
         super().check_files()
         check_exr(self.formats)
+
+
+def check_pixel_size(pixel_size: float) -> None:
+    """Raise UsageError for a pixel size (mm) out of the range of a surface."""
+    if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
+        raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
+
+
+def parse_indices(text: str, option: str) -> tuple[int, ...]:
+    """Return the whole numbers of "0,5,12". Raises UsageError."""
+    try:
+        return tuple(int(item) for item in text.split(","))
+    except ValueError:
+        raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
+
+
+class Shard(NamedTuple):
+    """Part `number` of a batch of `n_parts`, counted from 1."""
+
+    number: int
+    n_parts: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Return the shard of "3/8". Raises UsageError."""
+        found = re.fullmatch(r"([0-9]{1,18})/([0-9]{1,18})", text)
+        if found is None:
+            raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
+        number, count = int(found[1]), int(found[2])
+        if not 1 <= number <= count:
+            raise UsageError(
+                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
+        return cls(number, count)
+
+
+class BatchOptions(Record, frozen=True, kw_only=True):
+    """The captures of `infer`, what is computed again, and what is printed."""
+
+    captures: Annotated[tuple[Path, ...], Option("Arguments", "CAPTURE",
+        "Folders with the images of one object each, or films.", repeated=True)]
+    shard: Annotated[Shard | None, Option("Processes and machines", "I/N",
+        "Process shard I of N: captures I, I+N, I+2N, ...", parse=Shard.parse)] = None
+    update: Update = False
+    overwrite: Overwrite = False
+    as_json: Annotated[bool, Option("Output", "", "Print a JSON list of the reports on stdout, and nothing else.",
+        names=("--json",))] = False
+    as_json_lines: Annotated[bool, Option("Output", "",
+        "Print each report as one line of JSON on stdout when its capture ends.", names=("--jsonl",))] = False
+    quiet: Quiet = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.as_json and self.as_json_lines:
+            raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
+        if self.overwrite and self.update:
+            raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
+
+    @property
+    def redo(self) -> Redo:
+        """Which captures are computed that have results."""
+        return "all" if self.overwrite else "changed" if self.update else "nothing"
+
+
+class WatchOptions(Record, frozen=True, kw_only=True):
+    """The options of `watch`, as its help describes them."""
+
+    folder: Annotated[Path, Option("Arguments", "FOLDER",
+        "Folder in which captures arrive, a subfolder or film for each.")]
+    options: Annotated[tuple[str, ...], Option("Arguments", "-- OPTIONS", "Options of infer, after two dashes.",
+        repeated=True)] = ()
+    marker: Annotated[str | None, Option("Captures", "NAME", "File that appears in a subfolder when it is complete.",
+        default="see --settle")] = None
+    settle: Annotated[NotNegative, Option("Captures", "SECONDS",
+        "A film, or without --marker a subfolder, is complete when nothing in it changed for so long.")] = 5.0
+
+
+class InfoOptions(Display, frozen=True, kw_only=True):
+    """The options of `info` beside those of Reading, as its help describes them."""
+
+    capture: Annotated[Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")]
+    auto_mask: Annotated[bool, Option("Input", "", "If there is no mask, find the object in the images.")] = False
+    check_lights: Annotated[bool, Option("Lights", "",
+        "List other readings of the light file, and how well the images fit each.")] = False
+    mended_lights: Annotated[Path | None, Option("Lights", "FILE",
+        "Write the light directions in the order and frame that fit the images best, if the light file does"
+        " not.")] = None
+    plot: Annotated[Path | None, Option("Output", "FILE", "Also plot the light directions to a PNG file.")] = None
+    overwrite: Annotated[bool, Option("Output", "", "Replace an earlier plot or file of lights.")] = False

@@ -20,8 +20,8 @@ from splinecli.errors import InputError, UsageError
 from splinecli.methods.estimator import student_sizes
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import AUTOMATIC_FROM
-from splinecli.pipeline.infer_options import BASE_BYTES, Reading, infer_bytes
+from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, infer_bytes
+from splinecli.pipeline.infer_options import Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 

@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,16 +16,18 @@ from splinecli.capture.formats.images import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import read_camera_matrix
-from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
+from splinecli.documents import SurfaceFacts, Unit
+from splinecli.errors import InputError, SplinecliError
 from splinecli.maths.normals import Convention
 from splinecli.output_files import BYTES_OF_SURFACE, MAPS, NORMALS, REPORT
+from splinecli.pipeline.infer_options import check_pixel_size
+from splinecli.pipeline.options import IntegrateOptions
 from splinecli.results.files import UnfinishedError, read_report
-from splinecli.surface.bilateral_equations import STIFFNESS
+from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.mesh import decimated_mesh, surface_mesh
 from splinecli.surface.pixel_grid import focal_length, ray_basis
 from splinecli.surface.surface_files import (
-    DEFAULT_FORMATS,
     SURFACE_FILES,
     SURFACE_REPORT,
     Surface,
@@ -38,8 +40,6 @@ from splinecli.system.machine import import_extra
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files
 
-SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
-
 
 def make_surface(
     normal_map: NDArray[np.float32],
@@ -47,7 +47,7 @@ def make_surface(
     camera_matrix: NDArray[np.floating] | None = None,
     colours: NDArray[np.uint8] | None = None,
     *,
-    stiffness: float = STIFFNESS,
+    discontinuity: float = DISCONTINUITY,
     largest_step: float | None = None,
     n_triangles: int | None = None,
     pixel_size_mm: float | None = None,
@@ -65,7 +65,13 @@ def make_surface(
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
-        normal_map, mask, camera_matrix, stiffness=stiffness, prior=prior, prior_detail=prior_detail, progress=progress
+        normal_map,
+        mask,
+        camera_matrix,
+        discontinuity=discontinuity,
+        prior=prior,
+        prior_detail=prior_detail,
+        progress=progress,
     )
     surface = depth, mask, camera_matrix, colours
     if n_triangles is None:
@@ -73,23 +79,25 @@ def make_surface(
     else:
         mesh = decimated_mesh(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
-    unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel
+    unit: Unit = "pixel" if camera_matrix is None else "mean depth"
+    millimetres = 1 / pixel
     if prior is not None and camera_matrix is not None:
         unit, millimetres = "millimetre", 1.0
     elif pixel_size_mm is not None:
         unit, millimetres, scale = "millimetre", 1.0, pixel_size_mm / pixel
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
-    report = {
-        "camera": "orthographic" if camera_matrix is None else "perspective",
-        "unit": unit,
-        "pixel_size_mm": pixel_size_mm,
-        "range": [float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax)],  # the digits of float32
-        "n_vertices": len(mesh.vertices),
-        "n_triangles": len(mesh.triangles),
-        "normal_texture": mesh.normal_texture is not None,
-        "stiffness": stiffness,
-    }
-    return Surface(depth, mesh, unit, millimetres), report
+    low, high = (float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax))  # the digits of float32
+    report = SurfaceFacts(
+        camera="orthographic" if camera_matrix is None else "perspective",
+        unit=unit,
+        pixel_size_mm=pixel_size_mm,
+        range=(low, high),
+        n_vertices=len(mesh.vertices),
+        n_triangles=len(mesh.triangles),
+        normal_texture=mesh.normal_texture is not None,
+        discontinuity=discontinuity,
+    )
+    return Surface(depth, mesh, unit, millimetres), report.as_dict()
 
 
 def view_of_report(
@@ -111,65 +119,19 @@ def view_of_report(
     # Without a surface, it only scaled near lamps, whose unit may be any.
     if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
-    check_pixel_size(pixel_size_mm)
+    if pixel_size_mm is not None:
+        check_pixel_size(pixel_size_mm)
     return matrix, None if pixel_size_mm is None else pixel_size_mm * window.step
 
 
-def check_pixel_size(pixel_size: float | None) -> None:
-    """Raise UsageError for a pixel size (mm) out of range."""
-    if pixel_size is not None and not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
-        raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
-
-
-SCHEMA = 2  # rises when a field of the report changes its meaning
-
 INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder, exact ones first
-
-
-@dataclass(frozen=True, kw_only=True)
-class IntegrateOptions:
-    """The options of `integrate`, as its help describes them; None is the default in the help. Raises UsageError."""
-
-    normals: Path
-    output: Path | None = None
-    mask: Path | None = None
-    camera_matrix: Path | None = None
-    stiffness: float | None = None
-    prior: Path | None = None
-    prior_detail: float | None = None
-    largest_step: float | None = None
-    pixel_size: float | None = None
-    decimate: int | None = None
-    colours: Path | None = None
-    formats: tuple[str, ...] = DEFAULT_FORMATS
-    convention: Convention | None = None
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        check_pixel_size(self.pixel_size)
-        if self.decimate is not None and self.decimate < 1:
-            raise UsageError(f"--decimate is {self.decimate}, expected a number of triangles of at least 1")
-        if self.prior_detail is not None and self.prior is None:
-            raise UsageError("--prior-detail needs --prior")
-        for name in self.formats:
-            check_one_of("format", name, SURFACE_FILES)
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the results."""
-        return self.output or (self.normals if self.normals.is_dir() else self.normals.parent)
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """The names of the files that may be written."""
-        return (*file_names(self.formats), SURFACE_REPORT)
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Integrate a normal map, write the surface and its report, and return the report.
 
     Raises InputError if a file cannot be read, or the files do not fit together; OutputError if the results exist and
-    `overwrite` is not set, or cannot be written; UsageError if the stiffness or the largest step is negative.
+    `overwrite` is not set, or cannot be written; UsageError if the discontinuity or the largest step is negative.
     """
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
@@ -194,9 +156,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         options.normals,
         hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
     )
-    stiffness = options.stiffness
-    if stiffness is None:
-        stiffness = STIFFNESS if made_by is None else float(made_by["options"]["stiffness"])
+    discontinuity = options.discontinuity
+    if discontinuity is None:
+        discontinuity = DISCONTINUITY if made_by is None else float(made_by["options"]["discontinuity"])
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
     pixel_size = options.pixel_size
     if made_by is not None:
@@ -217,7 +179,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             mask,
             camera_matrix,
             colours,
-            stiffness=stiffness,
+            discontinuity=discontinuity,
             largest_step=options.largest_step,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
@@ -226,7 +188,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             progress=advance,
         )
     report = {
-        "schema": SCHEMA,
+        "schema": 3,
         "normals": str(options.normals),
         "colours": None if picture is None else str(picture),
         "prior": None if options.prior is None else str(options.prior),
@@ -288,8 +250,8 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
-        convention, stiffness = report["options"]["convention"], float(report["options"]["stiffness"])
-        if convention in get_args(Convention) and 0 <= stiffness < math.inf:
+        convention, discontinuity = report["options"]["convention"], float(report["options"]["discontinuity"])
+        if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
             return report
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         pass

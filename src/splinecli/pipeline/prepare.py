@@ -1,15 +1,18 @@
 """What `prepare` does: captures with ground truth and rendered scenes become a pixel set."""
 
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from splinecli.capture import find_captures
 from splinecli.errors import InputError, UsageError
 from splinecli.output_files import CONTACT_SHEET
 from splinecli.pictures.maps import contact_sheet, encode_png
-from splinecli.pipeline.distribution import ClusterOptions, Item, LostError, distributor
+from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.infer_options import ClusterOptions
+from splinecli.pipeline.options import PrepareOptions
 from splinecli.pixel_sets.entries import (
     CaptureChangedError,
     ScenePlan,
@@ -19,47 +22,32 @@ from splinecli.pixel_sets.entries import (
     save_rendered,
 )
 from splinecli.pixel_sets.store import MANIFEST, PixelSet, PixelSetWriter
+from splinecli.synthesis.scenes import SceneConfig
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
 from splinecli.system.progress import SILENT, Advance, Observer
 from splinecli.system.publishing import held_folder
 
 
-def prepare_pixel_set(
-    output: Path,
-    captures: Sequence[Path],
-    plan: ScenePlan,
-    *,
-    as_stored: bool = False,
-    white_level: float | None = None,
-    update: bool = False,
-    cluster: ClusterOptions | None = None,
-    observer: Observer = SILENT,
-) -> dict[str, Any]:
-    """Write a pixel set, or add to it, and return its summary.
+def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
+    """Write a pixel set, or add to it, and return its summary, the values that `prepare --json` prints.
 
-    A capture that cannot be used is left out, and the observer receives the error. Every other error ends the work.
-    The same call then continues where it stopped.
-
-    Args:
-        output: the folder of the set, new or an earlier set to add to.
-        as_stored, white_level: see add_capture.
-        update: read captures again that changed since they were added.
-        cluster: the processes that render scenes; None for this process.
-
-    Returns:
-        The values that `prepare --json` prints. `skipped` lists the captures that were left out, each with the
-        reason and an exit code.
+    A capture that cannot be used is left out, and the observer receives the error; `skipped` of the summary has the
+    reason and an exit code. Every other error ends the work. The same call then continues where it stopped.
 
     Raises:
         InputError: a mesh cannot be used.
         OutputError: the set cannot be written, or has a scene that was rendered with other settings.
         UsageError: there is nothing to prepare, or the packages of the extra `render` are not installed.
     """
+    output, config = options.output, SceneConfig()
+    config = replace(config, size=options.size or config.size, lights=options.n_lights or config.lights)
+    plan = ScenePlan(config, options.seed, options.scenes, options.meshes, options.views, options.reliefs)
+    captures = [folder for source in options.sources for folder in find_captures(source)]
     if not captures and not plan.names:
         raise UsageError("nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE")
     check_writable(output)
     plan.check_inputs()
-    cluster = cluster and cluster.on_cores(len(plan.names))
+    cluster = ClusterOptions(workers=options.processes.workers).on_cores(len(plan.names))
     with held_folder(output, observer.warn):
         writer = PixelSetWriter(output)
         plan.check_set(writer)
@@ -68,7 +56,14 @@ def prepare_pixel_set(
             skipped: list[dict[str, Any]] = []
             for name, folder in named.items():
                 try:
-                    add_capture(writer, name, folder, as_stored=as_stored, white_level=white_level, update=update)
+                    add_capture(
+                        writer,
+                        name,
+                        folder,
+                        as_stored=options.as_stored,
+                        white_level=options.white_level,
+                        update=options.update,
+                    )
                     observer.say(writer.describe(name))
                 except (InputError, CaptureChangedError, OSError) as refused:
                     error = as_splinecli_error(refused, folder) if isinstance(refused, OSError) else refused

@@ -6,17 +6,19 @@ import io
 import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import convert
 
 from splinecli import __version__
 from splinecli.capture import Capture
 from splinecli.capture.light_files import rows_text
 from splinecli.capture.record import name_reading
-from splinecli.maths.normals import Convention, describe, encode_picture
+from splinecli.documents import Distillation, EstimateReport, NearLampsReport, UsedWeights, WarningReport
+from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
 from splinecli.output_files import (
     ERROR_MAP,
     FOUND_DIRECTIONS,
@@ -40,9 +42,6 @@ if TYPE_CHECKING:
     from splinecli.system.progress import Clock
 
 
-SCHEMA = 3  # rises when a field of the report changes its meaning
-
-
 def report_of(
     estimate: NormalEstimate,
     estimator: Estimator,
@@ -61,39 +60,37 @@ def report_of(
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
     height, width = capture.mask.shape
-    return {
-        "schema": SCHEMA,
-        "capture": capture.name,
-        "method": estimator.name,
-        "weights": estimator.weights,
-        "n_lights": capture.n_lights,
-        "light_indices": list(capture.light_indices),
-        "light_file": None if light_file is None else str(light_file.absolute()),
-        "light_directions": capture.light_directions.round(6).tolist(),
-        "light_errors_deg": None if capture.light_errors_deg is None else capture.light_errors_deg.round(2).tolist(),
-        "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
-        "camera_matrix": None if capture.camera_matrix is None else capture.camera_matrix.tolist(),
-        "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
-        "n_pixels": capture.n_pixels,
-        "image_size": [width, height],
-        "device": estimator.device,
-        "precision": estimator.precision,
-        "distillation": distillation,
-        "peak_memory_mib": peak_memory_mib(),
-        "warnings": [{"code": warning.code, "text": warning.text} for warning in capture.warnings],
-        "angular_error_deg": None
-        if errors is None
-        else {name: round(value, 4) for name, value in asdict(errors).items()},
-        "expected_under_5": None if expected is None else round(expected, 4),
-        "capture_judged": None if expected is None else estimate.capture_judged,
-        "options": options,
-        "inputs_sha256": inputs,
-        "version": __version__,
-        "reading": name_reading(as_stored=options["as_stored"]),
-        "white_level": None if capture.white_level is None else asdict(capture.white_level),
-        "removed_blur": None if capture.removed_blur is None else round(capture.removed_blur, 2),
-        "surface": None,
-    }
+    return EstimateReport(
+        schema=3,
+        capture=capture.name,
+        method=estimator.name,
+        weights=None if estimator.weights is None else UsedWeights(**estimator.weights),
+        n_lights=capture.n_lights,
+        light_indices=list(capture.light_indices),
+        light_file=None if light_file is None else str(light_file.absolute()),
+        light_directions=capture.light_directions.round(6).tolist(),
+        light_errors_deg=None if capture.light_errors_deg is None else capture.light_errors_deg.round(2).tolist(),
+        near_lamps=None if capture.lamps is None else NearLampsReport(**capture.lamps.as_dict()),
+        camera_matrix=None if capture.camera_matrix is None else capture.camera_matrix.tolist(),
+        estimated_intensities=None if intensities is None else intensities.round(4).tolist(),
+        n_pixels=capture.n_pixels,
+        image_size=(width, height),
+        device=estimator.device,
+        precision=estimator.precision,
+        distillation=None if distillation is None else convert(distillation, Distillation),
+        peak_memory_mib=peak_memory_mib(),
+        warnings=[WarningReport(code=warning.code, text=warning.text) for warning in capture.warnings],
+        angular_error_deg=None if errors is None else AngularErrors(*(round(value, 4) for value in astuple(errors))),
+        expected_under_5=None if expected is None else round(expected, 4),
+        capture_judged=None if expected is None else estimate.capture_judged,
+        options=dict(options),
+        inputs_sha256=inputs,
+        version=__version__,
+        reading=name_reading(as_stored=options["as_stored"]),
+        white_level=capture.white_level,
+        removed_blur=None if capture.removed_blur is None else round(capture.removed_blur, 2),
+        surface=None,
+    ).as_dict()
 
 
 def peak_memory_mib() -> int | None:

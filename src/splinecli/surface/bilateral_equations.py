@@ -11,7 +11,7 @@ Here r is the ray through the pixel, scaled to z = -1, and dr its change to the 
 Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to one
 of them. The method therefore weights the squared residual towards each side by
 
-    share = sigmoid(stiffness * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
+    share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
 
 A side without a neighbour counts as a gap of zero. In the paper, noise and small errors of the normals change the
 shares, too, and the surface tears along rows and columns of pixels where it is continuous. Here a share counts only as
@@ -34,7 +34,7 @@ from splinecli.maths.normals import unit
 from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
-STIFFNESS = 2.0  # how easily the surface tears, as in the paper
+DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
 CONTRADICTION = 0.3  # residual that contradicts a normal: that of a frontal one which is off by 17 degrees
 
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
@@ -75,7 +75,7 @@ class BilateralEquations:
             (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
         )
 
-    def weigh(self, heights: Doubles, stiffness: float) -> tuple[Doubles, Doubles]:
+    def weigh(self, heights: Doubles, discontinuity: float) -> tuple[Doubles, Doubles]:
         """Return the weights of all pairs at the heights (P,), and their flows.
 
         The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
@@ -92,7 +92,7 @@ class BilateralEquations:
             residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
             for pixels, residual in zip((near, far), residuals, strict=True):
                 largest[pixels] = np.maximum(largest[pixels], np.abs(residual))
-            share_ahead = expit(stiffness * self.facing**2 * (behind**2 - ahead**2))
+            share_ahead = expit(discontinuity * self.facing**2 * (behind**2 - ahead**2))
             share_ahead = 0.5 - (share_ahead - 0.5) * np.expm1(-((largest / CONTRADICTION) ** 2))
             weight, flow = np.zeros_like(gap), np.zeros_like(gap)
             shares = share_ahead[near], 1 - share_ahead[far]

@@ -18,7 +18,7 @@ import numpy as np
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Doubles, Floats, Singles
 from splinecli.maths.normals import unit
-from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations, LaplacianSolver
+from splinecli.surface.bilateral_equations import DISCONTINUITY, SMALLEST_COSINE, BilateralEquations, LaplacianSolver
 from splinecli.surface.pixel_grid import Blocks, focal_length
 
 _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and refuses zero vectors
@@ -41,7 +41,7 @@ def integrate_normals(
     mask: Bools | None = None,
     camera_matrix: Floats | None = None,
     *,
-    stiffness: float = STIFFNESS,
+    discontinuity: float = DISCONTINUITY,
     prior: Floats | None = None,
     prior_detail: float | None = None,
     progress: Progress = lambda share: None,
@@ -57,7 +57,7 @@ def integrate_normals(
         mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
         camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV: columns count to the
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
-        stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
+        discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
         prior: (H, W), a coarse surface from elsewhere, as a scanner gives it: heights or depths like the result, NaN
             where it is not known. The result has its shape in the large, its offset and, in depths, its scale.
         prior_detail: the width in pixels of the waves that come from prior and normals in equal parts. Wider ones
@@ -69,8 +69,8 @@ def integrate_normals(
         InputError: the mask is empty, a normal in the mask is not a unit vector, the camera matrix is not valid, or the
             prior has no value in the mask, or clearly another direction or unit.
     """
-    if not (isfinite(stiffness) and stiffness >= 0):
-        raise UsageError(f"the stiffness is {stiffness:g}, expected a number of at least 0")
+    if not (isfinite(discontinuity) and discontinuity >= 0):
+        raise UsageError(f"the discontinuity is {discontinuity:g}, expected a number of at least 0")
     if mask is None:
         mask = _mask_of_normals(normal_map)
     _check_maps(normal_map, mask)
@@ -84,7 +84,7 @@ def integrate_normals(
     surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
     if known is not None:
         _check_prior(surface)
-    return _depth_map(_integrate(surface, stiffness, progress), mask, camera_matrix, known)
+    return _depth_map(_integrate(surface, discontinuity, progress), mask, camera_matrix, known)
 
 
 def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
@@ -95,7 +95,9 @@ def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
     kept: k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
-    return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(np.float32)
+    return integrate_normals(normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(
+        np.float32
+    )
 
 
 class _Surface(NamedTuple):
@@ -121,7 +123,7 @@ class _Surface(NamedTuple):
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
 
-def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Doubles:
+def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Doubles:
     """Return the heights (P,) of the mask's pixels; see integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
@@ -133,13 +135,13 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Doubl
     heights: Doubles = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
-    precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if stiffness > 0 else 1, 1.0
+    precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
     is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
-    if is_huge or (n_pixels > _COARSEST and stiffness > 0):
+    if is_huge or (n_pixels > _COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
-        of_blocks[blocks.mask] = _integrate(coarse, stiffness, lambda share: progress((1 - own_share) * share))
+        of_blocks[blocks.mask] = _integrate(coarse, discontinuity, lambda share: progress((1 - own_share) * share))
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights
@@ -149,7 +151,7 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Doubl
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
     known_heights = 0.0 if prior is None else np.nan_to_num(prior)
     for _ in range(most):
-        weights, flows = equations.weigh(heights, stiffness)
+        weights, flows = equations.weigh(heights, discontinuity)
         change = solver.solve(weights, flows, precision=precision, pull=pull, distance=heights - known_heights)
         heights += change
         progress(own_share / most)

@@ -1,12 +1,16 @@
 """Batches of training pixels from any source: what a capture would show of them, and the truth."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import Annotated, NamedTuple, Protocol, Self
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
+from splinecli.records import Count, Share
 from splinecli.synthesis import faults
+
+LightCount = Annotated[int, Meta(ge=3)]
 
 
 @dataclass(frozen=True)
@@ -17,19 +21,19 @@ class CaptureConfig:
     """
 
     # min_lights, max_lights, usual_lights: see draw_light_counts
-    min_lights: int = 4
-    max_lights: int = 96
-    usual_lights: int = 10
+    min_lights: LightCount = 4
+    max_lights: LightCount = 96
+    usual_lights: LightCount = 10
     # usual number of pixels of one capture, which share its lights, materials and faults. 1 draws each on its own.
-    capture_pixels: int = 1
-    ambient_share: float = 0.5  # captures under ambient light; generated pixels that are drawn one by one, too
-    light_direction_error_share: float = 0.5  # pixels with errors of the light directions
-    light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities
-    unequal_lights_share: float = 0.5  # pixels whose lights differ in intensity, which is divided out
-    saturated_share: float = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
+    capture_pixels: Count = 1
+    ambient_share: Share = 0.5  # captures under ambient light; generated pixels that are drawn one by one, too
+    light_direction_error_share: Share = 0.5  # pixels with errors of the light directions
+    light_intensity_error_share: Share = 0.5  # pixels with errors of the light intensities
+    unequal_lights_share: Share = 0.5  # pixels whose lights differ in intensity, which is divided out
+    saturated_share: Share = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
     sensor_noise: bool = True  # whether there are noise and quantisation
-    eight_bit_share: float = 0.3  # pixels with 8 bits; the others have 10 to 16
-    optics_share: float = 0.75  # captures, photographed as images, that a lens and a sensor changed; see draw_optics
+    eight_bit_share: Share = 0.3  # pixels with 8 bits; the others have 10 to 16
+    optics_share: Share = 0.75  # captures, photographed as images, that a lens and a sensor changed; see draw_optics
 
     def captures(self, pixels: int) -> int:
         """Return the number G of captures in a draw of so many pixels. Pixel p belongs to capture p % G."""

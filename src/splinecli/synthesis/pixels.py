@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
+from splinecli.records import Share
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.synthesis.principled import PrincipledMaterial, choose, draw_material
@@ -140,9 +141,9 @@ class PixelGeneratorConfig(CaptureConfig):
 
     cast_shadows: bool = True
     interreflections: bool = True
-    wall_share: float = 0.45
-    second_wall_share: float = 0.2
-    mixed_share: float = 0.2
+    wall_share: Share = 0.45
+    second_wall_share: Share = 0.2
+    mixed_share: Share = 0.2
 
 
 @dataclass(frozen=True)

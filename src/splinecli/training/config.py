@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
+from splinecli.records import BelowOne, Count, Natural, NotNegative, Share, settings
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 
@@ -24,54 +25,54 @@ class TrainingConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     pixels: PixelGeneratorConfig = field(default_factory=PixelGeneratorConfig)
     # the sources of pixels and their weights. A weight is the source's share of the batches.
-    sources: dict[str, float] = field(default_factory=lambda: {GENERATOR: 1.0})
+    sources: dict[str, NotNegative] = field(default_factory=lambda: {GENERATOR: 1.0})
     start_from: str = ""  # name or file of the weights that the run starts from; empty for random ones
-    held_share: float = 0.1  # share of the scenes of a pixel set that is for validation
-    batch_size: int = 256  # pixels a step; captures a step for the refinement net
+    held_share: Share = 0.1  # share of the scenes of a pixel set that is for validation
+    batch_size: Count = 256  # pixels a step; captures a step for the refinement net
     # number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal numbers of
     # lights. The number of processes must divide it.
-    shards: int = 4
+    shards: Count = 4
     # "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates` steps for
     # NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and trains the error head
     # alone. "refine_net" fixes all these and trains the refinement nets on pixel sets of rendered scenes.
     updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
-    ne_net_updates: int = 5
-    learning_rate: float = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
+    ne_net_updates: Count = 5
+    learning_rate: NotNegative = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
     # "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth for the last
     # tenth of the run.
     schedule: Literal["cosine", "stepped"] = "cosine"
-    warmup_steps: int = 300
+    warmup_steps: Natural = 300
     # steps, minutes: the length of the run. If minutes is above 0, it replaces steps.
-    steps: int = DEFAULT_STEPS
-    minutes: float = 0.0
+    steps: Count = DEFAULT_STEPS
+    minutes: NotNegative = 0.0
     # beta1, beta2, weight_decay: settings of AdamW. With weight_decay = 0, AdamW is Adam.
-    beta1: float = 0.9
-    beta2: float = 0.99
-    weight_decay: float = 1e-3
-    gradient_limit: float = 1.0  # largest norm of the gradient; 0 for none
-    average_decay: float = 0.9995  # decay of the running average of the weights, which is saved; 0 for none
+    beta1: BelowOne = 0.9
+    beta2: BelowOne = 0.99
+    weight_decay: NotNegative = 1e-3
+    gradient_limit: NotNegative = 1.0  # largest norm of the gradient; 0 for none
+    average_decay: BelowOne = 0.9995  # decay of the running average of the weights, which is saved; 0 for none
     # canonical networks see each pixel turned by up to this angle, either way, and half of the batches mirrored.
     # Estimates from several views can then be averaged.
-    turn_jitter_deg: float = 15.0
+    turn_jitter_deg: NotNegative = 15.0
     # angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
-    angle_weight: float = 1.0
-    map_weight: float = 1.0
-    masked_weight: float = 1.0
+    angle_weight: NotNegative = 1.0
+    map_weight: NotNegative = 1.0
+    masked_weight: NotNegative = 1.0
     # weight of the error of the differences between neighbours beside the angle, for the refinement nets
-    detail_weight: float = 1.0
+    detail_weight: NotNegative = 1.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
-    symmetric_weight: float = 0.0
-    asymmetric_weight: float = 0.0
+    symmetric_weight: NotNegative = 0.0
+    asymmetric_weight: NotNegative = 0.0
     # eta, lambda_c: settings of La
-    eta: float = 1.0
-    lambda_c: float = 50.0
+    eta: NotNegative = 1.0
+    lambda_c: NotNegative = 50.0
     # li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of LI-Net and in
     # NE-Net's Ls and La. eta is in summed cells in either case.
     li_net_norm: Norm = "mean"
     ne_net_norm: Norm = "sum"
     # "bfloat16" runs the convolutions in bfloat16 where the device computes in it, "float32" never
     precision: Literal["bfloat16", "float32"] = "bfloat16"
-    seed: int = 0
+    seed: Natural = 0
 
     def __post_init__(self) -> None:
         """Raise ModelError for settings that do not fit together."""
@@ -114,72 +115,27 @@ class TrainingConfig:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TrainingConfig:
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainingConfig:
         """Rebuild a configuration from plain values. Raises ModelError for an unknown key or an impossible value."""
         values = dict(values)
-        network, pixels = values.pop("network", {}), values.pop("pixels", {})
-        sources = values.pop("sources", {GENERATOR: 1.0})
-        for name, table in (("network", network), ("pixels", pixels), ("sources", sources)):
-            if not isinstance(table, dict):
-                raise ModelError(f"training setting {name!r} is {table!r}; expected a table of settings")
-        _check_settings(values, cls())
-        # Every configuration of an earlier version has them, most often unused: 0 and "".
-        pixels = {name: value for name, value in pixels.items() if name not in _REMOVED or value}
-        _check_settings(pixels, PixelGeneratorConfig())
-        for name, weight in sources.items():
-            if not _is_number(weight) or not 0 <= weight < math.inf:
-                raise ModelError(f"the weight of source {name!r} is {weight!r}; expected a number from 0")
-        return cls(
-            network=NetworkConfig.from_dict(network), pixels=PixelGeneratorConfig(**pixels), sources=sources, **values
-        )
+        for name, read in (("network", NetworkConfig.from_dict), ("pixels", _pixels)):
+            if name in values:
+                if not isinstance(values[name], dict):
+                    raise ModelError(f"training setting {name!r} is {values[name]!r}; expected a table of settings")
+                values[name] = read(values[name])
+        return cls(**settings(cls, values, "training setting", ModelError))
 
 
-_LOWEST = {
-    "batch_size": 1, "shards": 1, "steps": 1, "ne_net_updates": 1,
-    "min_lights": 3, "max_lights": 3, "usual_lights": 3, "capture_pixels": 1,
-}  # fmt: skip
-
-_REMOVED = ("measured_share", "measured_materials")
-
-_BELOW_ONE = ("beta1", "beta2", "average_decay")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGeneratorConfig) -> None:
-    """Raise ModelError for a setting that `defaults` lacks, or whose type or range differs."""
-    known, types = vars(defaults), get_type_hints(type(defaults))
-    for name, value in values.items():
-        if name in _REMOVED:
+def _pixels(values: dict[str, Any]) -> PixelGeneratorConfig:
+    # Every configuration of an earlier version has them, most often unused: 0 and "".
+    values = dict(values)
+    for name in ("measured_share", "measured_materials"):
+        if value := values.pop(name, None):
             raise ModelError(
                 f"training setting {name!r} is {value!r}, but training with measured materials was removed",
                 hint="Leave measured_share and measured_materials out",
             )
-        if name not in known or name in ("network", "pixels", "sources"):
-            raise ModelError(f"unknown training setting {name!r}; known are {', '.join(sorted(known))}")
-        default = known[name]
-        if get_origin(types[name]) is Literal:
-            choices = get_args(types[name])
-            expected, fits = " or ".join(map(repr, choices)), value in choices
-        elif isinstance(default, bool):
-            expected, fits = "true or false", isinstance(value, bool)
-        elif isinstance(default, str):
-            expected, fits = "a text", isinstance(value, str)
-        elif isinstance(default, int):
-            lowest = _LOWEST.get(name, 0)
-            expected = f"a whole number from {lowest}"
-            fits = isinstance(value, int) and not isinstance(value, bool) and value >= lowest
-        else:
-            fits = _is_number(value) and 0 <= value < math.inf
-            expected = "a number from 0"
-            if name.endswith("_share"):
-                fits, expected = fits and value <= 1, "a number from 0 to 1"
-            elif name in _BELOW_ONE:
-                fits, expected = fits and value < 1, "a number from 0 to below 1"
-        if not fits:
-            raise ModelError(f"training setting {name!r} is {value!r}; expected {expected}")
+    return PixelGeneratorConfig(**settings(PixelGeneratorConfig, values, "training setting", ModelError))
 
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.

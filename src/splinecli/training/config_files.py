@@ -55,22 +55,6 @@ def parse_parameter(text: str) -> Settings:
     return settings
 
 
-def parse_light_counts(text: str) -> dict[str, int]:
-    """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
-
-    The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
-    no such range, or a pixel would have fewer than 3 lights.
-    """
-    low, dash, high = text.partition("-")
-    try:
-        fewest, most = int(low), int(high if dash else low)
-    except ValueError:
-        raise UsageError(f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96") from None
-    if not 3 <= fewest <= most:
-        raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
-    return {"min_lights": fewest, "max_lights": most, "usual_lights": min(max(10, fewest), most)}
-
-
 def parse_sources(sets: Sequence[Path], generator_weight: float | None) -> dict[str, float]:
     """Return the weights of the sources: 1 for each set, and the generator's.
 

@@ -1,0 +1,402 @@
+"""The options of the commands that work on no single capture: frozen records, as their help describes them."""
+
+# Options are a table: name, type, panel and kind of value, then what they mean.
+# fmt: off
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
+
+from splinecli.capture.record import ESTIMATE
+from splinecli.errors import UsageError
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
+from splinecli.maths.normals import Convention
+from splinecli.maths.transfer import AUTOMATIC, parse_transfer
+from splinecli.methods import DEFAULT_METHOD, METHODS, MethodOptions, check_method, method_names
+from splinecli.pipeline.infer_options import (
+    CURVES,
+    DISCONTINUITY_HELP,
+    HERE,
+    LARGEST_PIXEL_MM,
+    MASK_IMAGE,
+    OUTPUT,
+    SMALLEST_PIXEL_MM,
+    AsStored,
+    ClusterOptions,
+    DeviceName,
+    Display,
+    Overwrite,
+    PrecisionName,
+    Quiet,
+    RandomSeed,
+    RefineLights,
+    Update,
+    Weights,
+    WhiteLevel,
+    Workers,
+    complete_weights,
+    parse_indices,
+)
+from splinecli.records import Count, FileName, Natural, NotNegative, Option, Positive, Record, Seed, listed
+from splinecli.surface.bilateral_equations import DISCONTINUITY
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.training import defaults
+
+DEFAULT_TRIALS = 100
+TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
+DEFAULT_LIGHTS = 10
+_MOST_DIGITS = 18  # of a number of images
+
+
+def parse_circle(text: str) -> tuple[float, float, float]:
+    """Return the numbers of "X,Y,R". Raises UsageError."""
+    try:
+        x, y, radius = (float(word) for word in text.split(","))
+        if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
+            return x, y, radius
+    except ValueError:
+        pass
+    raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
+
+
+class CalibrateOptions(Display, frozen=True, kw_only=True):
+    """The options of `calibrate`."""
+
+    balls: Annotated[tuple[Path, ...], Option("Arguments", "BALL", "Folders of images of one mirror ball each.",
+        repeated=True)]
+    circles: Annotated[tuple[tuple[float, float, float], ...], Option("Input", "X,Y,R",
+        "Outline of the ball in pixels, y down. May be repeated, once for each BALL.", names=("--circle",),
+        parse=parse_circle, repeated=True)] = ()
+    masks: Annotated[tuple[Path, ...], Option("Input", "FILE",
+        f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.", names=("--mask",), repeated=True)] = ()
+    ball_diameter: Annotated[Positive | None, Option("Input", "D",
+        "Diameter of each ball in any unit, such as millimeters: the unit of the lamps' positions.",
+        default="pixels")] = None
+    camera_matrix: Annotated[Path | None, Option("Input", "FILE", "Text file of the 3 x 3 camera matrix in pixels.",
+        default="focal length from EXIF, or a distant camera")] = None
+    gray_ball: Annotated[Path | None, Option("Light intensities", "DIR",
+        "Images of a matte gray ball under the same lights.")] = None
+    gray_card: Annotated[Path | None, Option("Light intensities", "DIR",
+        "Images of a matte gray card that faces the camera.")] = None
+    transfer: Annotated[str, Option("Light intensities", "CURVE",
+        "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.", complete=CURVES)] = AUTOMATIC
+    compare: Annotated[Path | None, Option("Output", "FILE",
+        "Compare the result with the light directions in a text file.")] = None
+    output: Annotated[Path, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = Path("calibration")
+    overwrite: Overwrite = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
+            raise UsageError(
+                "--transfer needs --gray-ball or --gray-card",
+                hint="Leave it out: the light directions do not depend on the curve",
+            )
+        if self.ball_diameter is not None and len(self.balls) < 2:
+            raise UsageError(
+                "--ball-diameter needs two balls or more",
+                hint="Photograph a second ball, or the same ball at another place: one ball gives no positions",
+            )
+        if self.gray_ball and self.gray_card:
+            raise UsageError("--gray-ball and --gray-card contradict each other", hint="Leave one out")
+        for option, values in (("--circle", self.circles), ("--mask", self.masks)):
+            if values and len(values) != len(self.balls):
+                times = "once" if len(values) == 1 else f"{len(values)} times"
+                raise UsageError(
+                    f"{option} is given {times} for {len(self.balls)} balls",
+                    hint="Give it once for each ball, in the same order",
+                )
+
+
+class IntegrateOptions(Display, frozen=True, kw_only=True):
+    """The options of `integrate`."""
+
+    normals: Annotated[Path, Option("Arguments", "NORMALS",
+        "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.")]
+    mask: Annotated[Path | None, Option("Input", "FILE",
+        MASK_IMAGE.format("object"), default="all pixels that have a normal")] = None
+    camera_matrix: Annotated[Path | None, Option("Input", "FILE",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
+        default="as in report.json beside the normal map, or orthographic")] = None
+    pixel_size: Annotated[Annotated[float, Meta(ge=SMALLEST_PIXEL_MM, le=LARGEST_PIXEL_MM)] | None, Option("Input",
+        "MM", "Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres.",
+        default="that of infer --surface, by report.json beside the normal map, or in pixels")] = None
+    convention: Annotated[Convention | None, Option("Input", "",
+        "Green channel of a normal map of colours: opengl is y up, directx is y down.",
+        default="as in report.json beside it, or opengl")] = None
+    colours: Annotated[Path | None, Option("Input", "FILE", "Image of the object's colours, for the mesh.",
+        default="albedo.png beside NORMALS, if NORMALS is a folder")] = None
+    prior: Annotated[Path | None, Option("Input", "FILE",
+        "Depth map of the same view from elsewhere, such as a scan: the surface takes its overall shape from"
+        " it, and the detail from the normals. .npy, .tif or .exr, with heights towards the camera in the unit"
+        " of the result, or with depths in millimetres for a perspective camera. NaN is unknown.")] = None
+    discontinuity: Annotated[NotNegative | None, Option("Method", "K",
+        DISCONTINUITY_HELP, default=f"as in report.json beside the normal map, or {DISCONTINUITY:g}")] = None
+    prior_detail: Annotated[Annotated[float, Meta(ge=1)] | None, Option("Method", "PIXELS",
+        "With --prior: shapes narrower than this come from the normals.", default="15 % of the object's size")] = None
+    largest_step: Annotated[NotNegative | None, Option("Method", "PIXELS",
+        "Leave out triangles whose corners differ by more than this height.", default="keep all")] = None
+    output: Annotated[Path | None, Option("Output", "OUT", "Folder of the results.", default="that of NORMALS",
+        names=OUTPUT)] = None
+    formats: Annotated[tuple[str, ...], Option("Output", "LIST",
+        f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or as a 16-bit"
+        " picture (png). exr needs the extra 'exr'.", names=("--format",), items=SURFACE_FILES)] = DEFAULT_FORMATS
+    decimate: Annotated[Count | None, Option("Output", "N",
+        "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs the extra 'mesh').",
+        default="all")] = None
+    overwrite: Overwrite = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.prior_detail is not None and self.prior is None:
+            raise UsageError("--prior-detail needs --prior")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the results."""
+        return self.output or (self.normals if self.normals.is_dir() else self.normals.parent)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the files that may be written."""
+        return (*file_names(self.formats), SURFACE_REPORT)
+
+
+def parse_light_count(text: str) -> int | None:
+    """Return a number of lights, or None for "all". Raises UsageError."""
+    try:
+        return None if text == "all" else int(text)
+    except ValueError:
+        raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
+
+
+def parse_skip(text: str) -> tuple[str, int]:
+    """Return ("bearPNG", 20) for "bearPNG=20" and ("*", 20) for "20". Raises UsageError."""
+    name, equals, count = text.rpartition("=")
+    if not count.isdecimal() or len(count) > _MOST_DIGITS or bool(name) != bool(equals):
+        raise UsageError(f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20")
+    return name or EVERY_CAPTURE, int(count)
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    """Return the row and the column of "120,85". Raises UsageError."""
+    indices = parse_indices(text, "--pixel")
+    if len(indices) != 2 or min(indices) < 0:
+        raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
+    return indices[0], indices[1]
+
+
+class EvaluateOptions(Display, frozen=True, kw_only=True):
+    """The options of `evaluate`.
+
+    The method "all" stands for all methods. None among the numbers of lights stands for all lights; without any, there
+    are DEFAULT_LIGHTS, or as many as in the draws file.
+    """
+
+    datasets: Annotated[tuple[Path, ...], Option("Arguments", "DATASET",
+        "Folders of captures with ground truth, or the captures themselves.", repeated=True)]
+    skip_first: Annotated[tuple[tuple[str, int], ...], Option("Input", "[CAPTURE=]N",
+        "Leave out the first N images of one capture, or of all. May be repeated.", default="0", parse=parse_skip,
+        repeated=True)] = ()
+    max_pixels: Annotated[Count | None, Option("Input", "N", "Score N random pixels of each capture.",
+        default="all")] = None
+    as_stored: AsStored = False
+    white_level: WhiteLevel = None
+    lights: Annotated[str | None, Option("Lights", "estimate",
+        "Estimate the lights of each draw from its images, and score them, too.",
+        default="the captures' light files")] = None
+    n_lights: Annotated[tuple[int | None, ...], Option("Lights", "K|all",
+        "Number of lights in each draw. May be repeated.", default=str(DEFAULT_LIGHTS), parse=parse_light_count,
+        repeated=True)] = ()
+    trials: Annotated[Count | None, Option("Lights", "T", "Number of random draws.",
+        default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} of four methods or more")] = None
+    seed: RandomSeed = 0
+    draws: Annotated[FileName | None, Option("Lights", "FILE",
+        "Draws of lights: each line has light indices, counted from 0.")] = None
+    light_noise_deg: Annotated[tuple[NotNegative, ...], Option("Lights", "SIGMA",
+        "Tilt the lights at random, with this standard deviation in degrees. May be repeated.", repeated=True)] = (0.0,)
+    refine_lights: RefineLights = False
+    light_error_deg: Annotated[float | None, Option("Lights", "SIGMA",
+        "With --refine-lights: usual error of the directions in degrees.", default="5")] = None
+    methods: Annotated[tuple[str, ...], Option("Method", "M",
+        f"Method to score: all, {listed(method_names())}. May be repeated.", names=("--method",),
+        complete=(*method_names(), "all"), repeated=True)] = (DEFAULT_METHOD,)
+    weights: Weights = None
+    rotations: Annotated[Count | None, Option("Method", "R",
+        "Average the network's result over R views of each pixel: its lights rotated, for spline-net also mirrored.",
+        default="1; cnn-ps: 10")] = None
+    device: DeviceName = "auto"
+    precision: PrecisionName = "auto"
+    jobs: Annotated[Count | None, Option("Speed", "N", "Number of trials at a time.",
+        default="number of cores; 1 on a GPU")] = None
+    cluster: ClusterOptions = HERE
+    figures: Annotated[bool, Option("Output", "",
+        "Draw every method's maps for the first draw of each capture.")] = False
+    pixels: Annotated[tuple[tuple[int, int], ...], Option("Output", "ROW,COLUMN",
+        "With --figures: show the observation maps of this pixel. May be repeated.", names=("--pixel",),
+        parse=parse_pixel, repeated=True)] = ()
+    output: Annotated[FileName, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = "evaluation"
+    overwrite: Annotated[bool, Option("Output", "", "Compute all trials again, also those stored in OUT.")] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.draws is not None and self.n_lights:
+            raise UsageError(
+                "--draws and --n-lights contradict each other",
+                hint="Leave --n-lights out: the draws determine the number of lights",
+            )
+        if self.draws is not None and self.trials is not None:
+            raise UsageError(
+                "--draws and --trials contradict each other",
+                hint="Leave --trials out: each line of the draws is a trial",
+            )
+        from splinecli.lights.light_fit import check_light_error
+
+        check_light_error(self.light_error_deg, refines=self.refine_lights)
+        if self.lights not in (None, ESTIMATE):
+            raise UsageError(
+                f"--lights is {self.lights}; expected {ESTIMATE}", hint="Without it, the captures' light files count"
+            )
+        if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
+            raise UsageError(
+                "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
+                hint="Leave these out",
+            )
+        if self.cluster != HERE and self.jobs is not None:
+            raise UsageError(
+                "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
+            )
+        for name in self.names:
+            check_method(name)
+        if self.pixels and not (self.figures and any(METHODS[name].observation_maps for name in self.names)):
+            raise UsageError(
+                "--pixel chooses the observation maps that --figures shows",
+                hint="Add --figures and --method spline-net",
+            )
+        _ = self.protocols
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the methods, each once."""
+        return list(dict.fromkeys(n for name in self.methods for n in (method_names() if name == "all" else [name])))
+
+    @property
+    def method_options(self) -> MethodOptions:
+        """The part of the options that concerns the methods."""
+        return MethodOptions(self.weights, self.rotations, device=self.device, precision=self.precision)
+
+    @property
+    def protocols(self) -> list[Protocol]:
+        """One protocol for each number of lights and each light noise. Raises UsageError."""
+        from splinecli.lights.light_fit import LIGHT_ERROR_DEG
+
+        usual = TRIALS_OF_MANY if len(self.names) >= MANY_METHODS else DEFAULT_TRIALS
+        counts = self.n_lights or ((DEFAULT_LIGHTS,) if self.draws is None else (None,))
+        return [
+            Protocol(
+                count,
+                usual if self.trials is None else self.trials,
+                self.seed,
+                None if self.draws is None else Path(self.draws),
+                noise,
+                self.max_pixels,
+                dict(self.skip_first),
+                self.as_stored,
+                self.white_level,
+                (self.light_error_deg or LIGHT_ERROR_DEG) if self.refine_lights else None,
+                self.lights is not None,
+            )
+            for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
+        ]
+
+
+class PrepareOptions(Display, frozen=True, kw_only=True):
+    """The options of `prepare`."""
+
+    sources: Annotated[tuple[Path, ...], Option("Arguments", "SOURCE",
+        "Captures with ground truth, folders of them, CyclesPS trees.", repeated=True)] = ()
+    as_stored: AsStored = False
+    white_level: WhiteLevel = None
+    update: Update = False
+    scenes: Annotated[Natural, Option("Scenes", "N", "Render N random scenes.")] = 0
+    meshes: Annotated[tuple[Path, ...], Option("Scenes", "FILE",
+        "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.", names=("--mesh",), repeated=True)] = ()
+    views: Annotated[Natural, Option("Scenes", "N",
+        "Render each mesh N times, from random views. By default once, along its +z axis.")] = 0
+    reliefs: Annotated[tuple[Path, ...], Option("Scenes", "FILE",
+        "Put this tileable normal map on half of the scenes. May be repeated.", names=("--relief",),
+        repeated=True)] = ()
+    size: Annotated[Annotated[int, Meta(ge=8)] | None, Option("Scenes", "PIXELS",
+        "Width and height of the rendered images.", default="128")] = None
+    n_lights: Annotated[Annotated[int, Meta(ge=16)] | None, Option("Scenes", "N",
+        "Number of lights of a rendered scene.", default="100")] = None
+    seed: Annotated[Seed, Option("Scenes", "S", "Seed of the random draws.")] = 0
+    output: Annotated[Path, Option("Output", "SET", "Folder of the pixel set.", names=OUTPUT)]
+    processes: Workers = Workers()
+
+
+def parse_light_counts(text: str) -> dict[str, int]:
+    """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
+
+    The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
+    no such range, or a pixel would have fewer than 3 lights.
+    """
+    low, dash, high = text.partition("-")
+    try:
+        fewest, most = int(low), int(high if dash else low)
+    except ValueError:
+        raise UsageError(f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96") from None
+    if not 3 <= fewest <= most:
+        raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
+    return {"min_lights": fewest, "max_lights": most, "usual_lights": min(max(10, fewest), most)}
+
+
+class TrainOptions(Record, frozen=True, kw_only=True):
+    """The options of `train`."""
+
+    sets: Annotated[tuple[Path, ...], Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.",
+        repeated=True)] = ()
+    preset: Annotated[str | None, Option("Settings", "NAME",
+        f"Settings to begin with: {', '.join(defaults.PRESET_NAMES)}.", default=defaults.DEFAULT_PRESET,
+        complete=defaults.PRESET_NAMES)] = None
+    config: Annotated[Path | None, Option("Settings", "FILE",
+        "Settings from a TOML file or a run's config.json.")] = None
+    param: Annotated[tuple[str, ...], Option("Settings", "NAME=VALUE",
+        "One setting, such as pixels.wall_share=0.3. May be repeated.", repeated=True)] = ()
+    start_from: Annotated[str | None, Option("Settings", "NAME|FILE", "Begin with these weights.",
+        default="random weights; preset refine: spline-net", complete=complete_weights)] = None
+    seed: Annotated[Seed | None, Option("Settings", "S", "Seed of the run.", default="0")] = None
+    generator_weight: Annotated[NotNegative | None, Option("Pixels", "W",
+        "Weight of generated pixels; each SET has weight 1.", default="0; 1 without SET")] = None
+    n_lights: Annotated[dict[str, int] | None, Option("Pixels", "K|MIN-MAX", "Number of lights of each pixel.",
+        default="the preset's", parse=parse_light_counts)] = None
+    steps: Annotated[Count | None, Option("Length", "N", "Train for N steps.",
+        default=f"{defaults.DEFAULT_STEPS:,}; presets paper: {defaults.PAPER_STEPS:,}, refine:"
+        f" {defaults.REFINE_STEPS:,}")] = None
+    minutes: Annotated[Annotated[float, Meta(ge=0.01)] | None, Option("Length", "M",
+        "Train for M minutes instead of a number of steps.", default="train for --steps")] = None
+    resume: Annotated[bool, Option("Length", "", "Continue from the run's checkpoint.")] = False
+    output: Annotated[Path, Option("Output", "RUN",
+        f"Folder of the run. Its files are updated every {defaults.CHECKPOINT_SECONDS} seconds.", names=OUTPUT)]
+    tensorboard: Annotated[bool, Option("Output", "",
+        "Also write RUN/tensorboard (needs the extra 'tensorboard').")] = False
+    quiet: Quiet = False
+    device: DeviceName = "auto"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps is not None and self.minutes is not None:
+            raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
+
+
+class ImportOptions(Record, frozen=True, kw_only=True):
+    """The options of `import-weights`."""
+
+    li_net: Annotated[Path, Option("Arguments", "G.ckpt", "The authors' LI-Net, which they call the generator.")]
+    ne_net: Annotated[Path, Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator.")]
+    output: Annotated[Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)]
+    overwrite: Annotated[bool, Option("Output", "", "Replace an existing file.")] = False
+    quiet: Quiet = False

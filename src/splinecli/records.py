@@ -1,0 +1,239 @@
+"""Records: frozen options, settings and documents, declared once and checked when they are made.
+
+A field's annotation gives its type, its range (`msgspec.Meta`) and, for an option of a command, an `Option`. The
+command line, the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages follow from it.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, is_dataclass
+from functools import lru_cache
+from math import isfinite
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
+
+from msgspec import Meta, Struct, ValidationError, convert, to_builtins
+from msgspec.structs import replace
+
+from splinecli.errors import SplinecliError, UsageError, check_one_of
+
+ARGUMENTS = "Arguments"
+PANELS = (
+    *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights", "Light intensities"),
+    *("Method", "Output", "Speed", "Processes and machines"),
+)
+"""The panels of the help, in their order."""
+
+PATH = object()
+FileName = Annotated[str, PATH]  # a path that is stored as text
+
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a field is given on the command line: as `--field-name`, or by `names`.
+
+    panel: one of PANELS. metavar: stands for the value; "" for a flag or a choice. default: what the help says of a
+    default of None. complete: the values that a shell offers, or a function that returns them. parse: makes the field's
+    value of a text, or of each where the option may be `repeated`. items: the names that may stand in a list "a,b".
+    """
+
+    panel: str
+    metavar: str
+    help: str
+    default: str | None = None
+    names: tuple[str, ...] = ()
+    complete: Callable[..., list[str]] | Collection[str] | None = None
+    parse: Callable[[str], Any] | None = None
+    items: Collection[str] = ()
+    repeated: bool = False
+
+    @property
+    def is_argument(self) -> bool:
+        """Whether it is given by its place."""
+        return self.panel == ARGUMENTS
+
+    def value_of(self, given: Any, title: str) -> Any:
+        """Return the field's value from what Typer gives. Raises UsageError."""
+        if self.items:
+            names = tuple(item.strip() for item in given.split(",") if item.strip())
+            for name in names:
+                if name not in self.items:
+                    problem = f"{title} has {name!r}; expected a list of {', '.join(self.items)}"
+                    raise UsageError(f"{problem}, such as {next(iter(self.items))}")
+            if not names:
+                raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
+            return names
+        if self.parse is None:
+            return tuple(given) if isinstance(given, list) else given
+        return tuple(map(self.parse, given)) if self.repeated else self.parse(given)
+
+
+class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A frozen record of options, whose fields are checked. Raises UsageError for a wrong value."""
+
+    def __post_init__(self) -> None:
+        for name, kind in field_types(type(self)).items():
+            option, value = option_of(kind), getattr(self, name)
+            fit(kind, value, f"option {name!r}" if option is None else long_name(name, option), UsageError)
+            for item in value if option is not None and option.items else ():
+                check_one_of(name.removesuffix("s"), item, option.items)  # type: ignore[union-attr]
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other values of some fields."""
+        return replace(self, **changes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        values: dict[str, Any] = to_builtins(self, enc_hook=str)
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Return the record that `as_dict` wrote. Raises UsageError for an unknown name or a wrong value."""
+        return cls(**settings(cls, values, "option", UsageError))
+
+    @classmethod
+    def from_arguments(cls, given: dict[str, Any]) -> Self:
+        """Take the record's values of a command line out of `given`, and return the record. Raises UsageError."""
+        values: dict[str, Any] = {}
+        for name, kind in field_types(cls).items():
+            option = option_of(kind)
+            if option is None and isinstance(kind, type) and issubclass(kind, Record):
+                values[name] = kind.from_arguments(given)
+            elif option is not None and (value := given.pop(name)) is not None:
+                title = long_name(name, option)
+                value = option.value_of(value, title)
+                if (number := number_of(kind)) is not None and option.parse is None:
+                    one: Any = Annotated[number, limits(kind)]
+                    items = [fit(one, item, title, UsageError, strict=False) for item in _each(value)]
+                    value = tuple(items) if option.repeated else items[0]
+                values[name] = str(value) if PATH in _metadata(kind) else value
+            elif option is not None and option.is_argument and option.repeated:
+                values[name] = ()
+        return cls(**values)
+
+
+@lru_cache
+def field_types(record: type) -> dict[str, Any]:
+    """Return the annotation of each field of a record or dataclass."""
+    hints = get_type_hints(record, include_extras=True)
+    names = record.__dataclass_fields__ if is_dataclass(record) else record.__struct_fields__  # type: ignore[attr-defined]
+    return {name: hints[name] for name in names}
+
+
+def settings(record: type, values: Mapping[str, Any], noun: str, error: type[SplinecliError]) -> dict[str, Any]:
+    """Return values from JSON or TOML in the types of the fields of a record or dataclass.
+
+    Raises the error for an unknown name or a wrong value; `noun` stands before the name in its message.
+    """
+    kinds = field_types(record)
+    for name in values:
+        if name not in kinds:
+            raise error(f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}")
+    return {name: fit(kinds[name], value, f"{noun} {name!r}", error) for name, value in values.items()}
+
+
+def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True) -> Any:
+    """Return a value in a type, such as a tuple for a list. Raises the error, which begins with the title.
+
+    If it is not strict, a text may stand for a number.
+    """
+    if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
+        return value
+    try:
+        found = convert(value, kind, strict=strict)
+        items = found.values() if isinstance(found, dict) else _each(found)
+        if all(isfinite(item) for item in items if isinstance(item, float)):
+            return found
+    except ValidationError:
+        pass
+    raise error(f"{title} is {value!r}; expected {in_words(kind)}")
+
+
+def option_of(kind: Any) -> Option | None:
+    """Return how a field of this annotation is given on the command line."""
+    return next((item for item in getattr(kind, "__metadata__", ()) if isinstance(item, Option)), None)
+
+
+def long_name(name: str, option: Option) -> str:
+    """Return the long name of an option, such as --n-lights, or the name of an argument."""
+    if option.is_argument:
+        return option.metavar
+    return option.names[0].split("/")[0] if option.names else f"--{name.replace('_', '-')}"
+
+
+def limits(kind: Any) -> Meta:
+    """Return the range of the numbers of a type."""
+    return next((item for item in _metadata(kind) if isinstance(item, Meta)), Meta())
+
+
+def _metadata(kind: Any) -> Iterator[Any]:
+    """Yield what is annotated to a type and its parts."""
+    yield from getattr(kind, "__metadata__", ())
+    for part in get_args(kind):
+        yield from _metadata(part)
+
+
+def plain(kind: Any) -> Any:
+    """Return a type without annotations; Path for a path that is stored as text, and a list for a tuple."""
+    if get_origin(kind) is Annotated:
+        return Path if PATH in kind.__metadata__ else plain(get_args(kind)[0])
+    if get_origin(kind) in (Union, types.UnionType):
+        return Union[tuple(map(plain, get_args(kind)))]  # noqa: UP007 - of a tuple
+    return list[plain(get_args(kind)[0])] if get_origin(kind) is tuple else kind  # type: ignore[misc]
+
+
+def in_words(kind: Any) -> str:
+    """Return what a value of a type is, such as "a number from 0 to 1"."""
+    bare = plain(kind)
+    if get_origin(bare) is Union:
+        bare = get_args(bare)[0]
+    if get_origin(bare) is Literal:
+        return " or ".join(map(repr, get_args(bare)))
+    if get_origin(bare) in (list, dict):
+        whole = "list" if get_origin(bare) is list else "table"
+        return f"a {whole}, each {in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
+    if bare not in (int, float):
+        return {bool: "true or false", str: "a text", Path: "a text"}.get(bare, "a table of settings")
+    words, given = "a whole number" if bare is int else "a number", limits(kind)
+    for bound, word in ((given.ge, "from"), (given.gt, "above"), (given.le, "to"), (given.lt, "to below")):
+        words += "" if bound is None else f" {word} {bound:.10g}"
+    return words if given.multiple_of is None else f"{words}, a multiple of {given.multiple_of}"
+
+
+def _each(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def number_of(kind: Any) -> type | None:
+    """Return int or float for numbers, and for None and lists of them."""
+    found = plain(kind)
+    while get_args(found) and get_origin(found) is not Literal:
+        found = get_args(found)[0]
+    return found if found in (int, float) else None
+
+
+def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma."""
+
+    def complete(incomplete: str) -> list[str]:
+        *typed, _ = incomplete.split(",")
+        return [",".join([*typed, name]) for name in items if name not in typed]
+
+    return complete
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return "a, b or c"."""
+    *most, last = names
+    return f"{', '.join(most)} or {last}" if most else last
