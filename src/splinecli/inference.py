@@ -7,8 +7,8 @@ photometric stereo problem", arXiv 2210.04655, alternate alike.)
 
 Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
-The pixels are processed in tiles. The working memory of a method is that of one tile; only the results grow with the
-capture.
+The pixels are processed in tiles, so the working memory of a method depends on the tile size; only the results grow
+with the capture.
 """
 
 import time
@@ -72,7 +72,7 @@ _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vec
 
 @dataclass(frozen=True)
 class NormalEstimate:
-    """The normals of one capture, and their errors where there is ground truth.
+    """The normals of one capture, and their errors if the capture has ground truth.
 
     normal_map: (H, W, 3) float32, unit inside the mask and zero outside.
     seconds: time spent on the estimation.
@@ -165,11 +165,11 @@ def _estimate(
 
 
 class PixelEstimates(NamedTuple):
-    """What an estimator found, before refinement.
+    """The results of an estimator, before refinement.
 
     normals: (P, 3) float32, unit, in the capture's frame.
     errors: (P, 2) float32, the distributions of their errors; None for methods without confidence.
-    light_of: the light of the pixels as they were seen last: without indirect light where that was removed.
+    light_of: the light of the pixels as used for the last estimate: without indirect light where that was removed.
     """
 
     normals: NDArray[np.float32]
@@ -188,7 +188,7 @@ def estimate_pixels(
 ) -> PixelEstimates:
     """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
 
-    Only the networks with a refiner remove indirect light. The refinement net also learns from what this returns.
+    Only the networks with a refiner remove indirect light. The refinement net also learns from these estimates.
 
     Args:
         mask: (H, W), with P true pixels.
@@ -218,7 +218,7 @@ def estimate_pixels(
         indirect = find_indirect_light(mask, observations, light_of, normals)
         if indirect is not None:
             light_of = partial(light_without, indirect)
-            # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
+            # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
             estimator = estimator.rebind(light_of, n_pixels)
             for pixels in parts_of_rows(n_pixels, tile_pixels):
                 changed = pixels[indirect.counts_at(observations[pixels], pixels)]
@@ -233,7 +233,7 @@ def _no_stage(_: str) -> AbstractContextManager[Progress]:
 
 
 def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
-    """Return what gives the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
+    """Return a function for the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
     lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
     places = PixelPlaces(capture.mask)
 
@@ -259,7 +259,7 @@ def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:
-    # A zero normal would count as an error of 0 degrees, and NaN would be left out of the mean.
+    # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
         if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():

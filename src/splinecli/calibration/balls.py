@@ -35,10 +35,10 @@ from splinecli.maths import Array, Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 
-DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
+DISTANT = 1e6  # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly parallel
 
 SHORTEST_LENS = 0.7
-"""Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
+"""Shortest usual focal length, in longer sides of the image. Telephones have it: 25 mm for 36 mm of film."""
 
 
 _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
@@ -62,7 +62,7 @@ class View:
         """Return a matrix (3, 3) that may be the true one."""
         factor = 1.0
         if not self.known:
-            # All rays of sight from parallel to those of the shortest lens, evenly.
+            # All rays of sight from parallel ones to the shortest lens, evenly.
             nearest = self.shortest / float(self.matrix[0, 0])
             factor = nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
@@ -94,7 +94,7 @@ def find_view(image: ImageFacts, matrix: Path | None) -> View:
 
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Return the focal length in pixels from EXIF tags; None where they do not tell it."""
+    """Return the focal length in pixels from EXIF tags; None if they do not contain it."""
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
             pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
@@ -184,7 +184,7 @@ def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doub
 
 
 def check_in_front(direction: Doubles, ray: Doubles) -> None:
-    """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
+    """Raise InputError if a light direction (3,) is level with the ball or behind it, as viewed from the camera."""
     if not direction @ ray < 0:
         problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
         raise InputError(problem, hint="Place all lights on the camera's side of the object")
@@ -207,7 +207,7 @@ class BallFiles:
 
     @cached_property
     def facts(self) -> tuple[ImageFacts, ...]:
-        """What the headers of the images state."""
+        """Facts from the headers of the images."""
         return tuple(map(read_facts, self.images))
 
 
@@ -240,9 +240,9 @@ class CalibratedLights:
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
-    """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
+    """Return the files of the ball in a folder, with images in natural order or in the order of filenames.txt.
 
-    A mask that is given replaces the one in the folder. Raises InputError where there are no images.
+    A mask that is given replaces the one in the folder. Raises InputError if the folder has no images.
     """
     images, listed = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
     if not listed and 2 * sum(map(is_mask_name, images)) < len(images):  # such as chrome.mask.tga

@@ -1,8 +1,8 @@
 """Intensities of lamps from a gray target, positions of near ones from several balls, and the report of a calibration.
 
 Positions of near lamps from two or more mirror balls, by triangulation. Each ball gives a ray: from the highlight on
-its surface in the direction of the lamp. The balls' centres, which the size of their outlines tells, lie near a plane z
-= const, which the object's mean plane should be.
+its surface in the direction of the lamp. The balls' centres, which follow from the size of their outlines, are near a
+plane z = const, and the object's mean plane should be that plane.
 """
 
 import math
@@ -75,8 +75,8 @@ def measure_light_intensities(
     for position, path in enumerate(files.images):
         ratios = values[position] / np.maximum(cosines[:, position], SMALLEST_COSINE)[:, None]
         if saturated is not None:
-            # A card is alike everywhere: saturated pixels are its brightest, and shift no median. On a ball, they lie
-            # where n.l is largest, and the others tell the same without them.
+            # A card is alike everywhere: saturated pixels are its brightest, and do not shift the median. On a ball,
+            # they are where n.l is largest, and the other pixels give the same intensity without them.
             ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
         ratios = ratios[(cosines[:, position] > SMALLEST_COSINE) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= _MIN_PIXELS else np.zeros(1)
@@ -150,7 +150,7 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # Each draw adds as much to the misses as the pixels had added to those of the images, if PIXEL_ERROR is right.
+    # If PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
     uncertainty = excess * np.quantile(errors, CONFIDENCE, axis=0, method="higher")
@@ -321,7 +321,7 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
         from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
-        # Smaller differences are no mistaken frame.
+        # Smaller differences do not indicate a wrong frame.
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of the light directions:"

@@ -4,8 +4,8 @@ Robust Lambertian fit, the starting point of the networks: iteratively reweighte
 weights. Observations below 5 % of the pixel's largest are treated as shadows and get a tiny weight. Large residuals get
 smaller weights, which approximates an L1 fit.
 
-Two halves of the lights: random errors differ from light to light, so the halves disagree about them. What all lights
-show alike is either right, or wrong in the same way for all pixels of a neighbourhood.
+Two halves of the lights: random errors differ from light to light, so the halves disagree about them. Anything that all
+lights agree on is either right, or wrong in the same way for all pixels of a neighbourhood.
 
 L1 minimises the sum of absolute residuals, which shadows and highlights affect less than the sum of squares. Trimmed LS
 leaves out shadows, and the darkest and brightest observations.
@@ -29,7 +29,7 @@ UNSHADED = 0.6
 observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
 a metal all others are dark beside the highlight."""
 
-FEWEST_LIT = 3  # number of brightest observations that never count as shadows, because a normal needs three
+FEWEST_LIT = 3  # number of brightest observations never treated as shadows, because a normal needs three
 
 
 def lit_observations(
@@ -53,7 +53,7 @@ def lit_observations(
     return lit if valid is None else lit & valid
 
 
-RIDGE = 1e-12  # Weight of |b|^2. It matters only where the lights of positive weight lie in one plane.
+RIDGE = 1e-12  # Weight of |b|^2. It matters only if the lights of positive weight are coplanar.
 
 _TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
 
@@ -133,14 +133,14 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing."""
+    """Normals from all lights, and the disagreement between two halves of the lights. The signs are arbitrary."""
 
     normals: Tensor  # (P, 3), unit, of least squares with all lights
-    # (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a share of
-    # the albedo. On a ring of lights, it is half the difference between the normals of the halves
+    # (P, 3), the least-squares solution for the residuals, with the sign flipped in one half, as a share of the albedo.
+    # On a ring of lights, it is half the difference between the normals of the halves
     change: Tensor
-    # (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal noise.
-    # Three lights have no residuals, so they do not show it
+    # (P, 1), in radians. Its mean square equals the mean square of the normals' random errors, if all observations
+    # have equal noise. Three lights leave no residuals, so they do not show it
     noise: Tensor
 
 

@@ -24,7 +24,7 @@ from torch.nn.functional import normalize
 
 from splinecli.fits.least_squares import lit_observations, weighted_least_squares
 
-FEWEST_LIT = 4  # number of brightest observations that never count as shadows: three for the normal, one for the noise
+FEWEST_LIT = 4  # number of brightest observations never treated as shadows: three for the normal, one for the noise
 RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
@@ -104,7 +104,7 @@ class _Fit(NamedTuple):
         return normalize(self.normals + (self.tangents @ move[..., None])[..., 0], dim=1)
 
     def replaced(self, trial: _Fit, better: Tensor) -> _Fit:
-        """Return this fit, with the trial in place of the pixels where it is better (P,)."""
+        """Return this fit, with the trial's values for the pixels it improves: `better` (P,)."""
         pairs = zip(trial, self, strict=True)
         return _Fit(*(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs))
 

@@ -1,7 +1,7 @@
 """Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
 
 The photographs show how bright each visible part of the object is under each light, after all reflections. A matte part
-is as bright from all sides. Estimated normals give the surface. Together they tell how much light arrives at a pixel
+is as bright from all sides. Estimated normals give the surface. Together they give the light that arrives at a pixel
 from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV
 1991, also alternate between the shape and the light on it.)
 
@@ -46,7 +46,7 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
+    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells copy the nearest block
     albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
@@ -57,7 +57,7 @@ class IndirectLight:
 
     def remove(self, observations: Singles, pixels: Rows) -> Singles:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
-        # Something is left of each observation, because what is gathered is never exact.
+        # Keep a share of each observation, because the gathered light is never exact.
         return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
     def counts_at(self, observations: Singles, pixels: Rows) -> Bools:
@@ -72,7 +72,7 @@ def find_indirect_light(
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
 
-    The camera counts as orthographic, whatever it is: only nearby parts exchange much light.
+    The camera is always treated as orthographic, because only nearby parts exchange much light.
 
     Args:
         mask: (H, W), with P true pixels.
@@ -113,7 +113,7 @@ def find_indirect_light(
     if exposure is None:
         return None
     # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak
-    # where the camera does not see what reflects.
+    # if the reflecting surface is hidden from the camera.
     exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
     # Pixels that all lamps graze may have any albedo.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
@@ -144,10 +144,10 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
 
 
 def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf, normals: Singles) -> float | None:
-    """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
+    """Return the factor from albedos in the observations' unit to true ones; None without visible indirect light.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
-    under a ring of lights, indirect light does so, too. It then counts as indirect.
+    under a ring of lights, indirect light is just as uniform, and the fit assigns it to the indirect part.
     """
     found = []
     step = max(1, len(normals) // 50_000)

@@ -19,7 +19,7 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
     Args:
         rows, columns: (N,), in pixels; (0, 0) is the centre of the first pixel.
         depth: (N,), as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here in
-            multiples of that of the mean plane.
+            multiples of the mean plane's depth.
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle

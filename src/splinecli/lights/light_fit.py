@@ -7,7 +7,7 @@ Lights in a wrong order are not.
 
 To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is
 linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a
-prior around the given ones. The prior holds what the images leave open: lights and normals may turn together. If the
+prior around the given ones. The prior fixes the remaining freedom: lights and normals may rotate together. If the
 light intensities are known, nothing else is open. If not, a prior on them holds the generalised bas-relief ambiguity
 (Belhumeur, Kriegman and Yuille, IJCV 1999).
 """
@@ -27,7 +27,7 @@ from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_nor
 from splinecli.maths import Doubles, Floats, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 
-LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
+LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 
 
 MIN_PIXELS_PER_LIGHT = 10
@@ -47,12 +47,12 @@ class Factors:
     # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
     # matrices is one between images, as a share of the mean brightness
     matrix: Doubles
-    image_residuals: Doubles  # (F,), root mean squares of what the factors do not explain of each image, in this unit
+    image_residuals: Doubles  # (F,), RMS residual of each image after the fit of the factors, in this unit
     intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
     def residual(self) -> float:
-        """What the factors do not explain of all images."""
+        """The residual of all images after the fit of the factors."""
         return float(np.linalg.norm(self.image_residuals))
 
     def with_free_intensities(self) -> Factors:
@@ -86,7 +86,7 @@ class Factors:
         for _ in range(_INTENSITY_ROUNDS):
             vectors = intensities[..., None] * light_directions
             transposed = vectors.swapaxes(1, 2)
-            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may lie in one plane
+            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may be coplanar
             matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
             along = np.einsum("cf,nfc->nf", self.matrix, matrices)
             intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
@@ -95,7 +95,7 @@ class Factors:
 
 
 def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
-    """Return the factors of observations (P, F), or None where there are too few lit ones.
+    """Return the factors of observations (P, F), or None if too few of them are lit.
 
     Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
     """
@@ -123,7 +123,7 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
 
 
 def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
-    """Return the misfits of the lights (F, 3) in random orders, in rising order."""
+    """Return the residuals of the lights (F, 3) in random orders, in rising order."""
     # A given order is compared with so many random ones.
     given = np.tile(np.arange(len(light_directions)), (250, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)
@@ -134,7 +134,7 @@ def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
 
 
 def shifted_orders(n_lights: int) -> NDArray[np.int64]:
-    """Return the orders (2 F, F) of all cyclic shifts, then those of the reversed order's; the first is the given."""
+    """Return the orders (2 F, F): all cyclic shifts, then all shifts of the reversed order; the first is as given."""
     steps = np.arange(n_lights)
     forward = (steps[None] + steps[:, None]) % n_lights
     return np.concatenate((forward, forward[:, ::-1]))
@@ -198,7 +198,7 @@ class LightFit(NamedTuple):
     """Lights that fit the images best near given ones."""
 
     directions: Doubles  # (F, 3), unit
-    intensities: Doubles  # (F,), relative to those of the observations
+    intensities: Doubles  # (F,), relative to the intensities by which the observations were divided
     # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
     # observation
     before: float
@@ -251,8 +251,8 @@ def would_refine(observations: Floats, factors: Factors | None, light_directions
 
     It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
-    # Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to
-    # be suggested. Few matte or shiny captures with exact lights have more.
+    # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is not tried only to
+    # be suggested. Few matte or shiny captures with exact lights exceed it.
     if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
     # Intensities that nobody measured are not the fault of the directions.
@@ -293,7 +293,7 @@ def refine_lights(
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
 ) -> LightFit | None:
-    """Return refined lights; None where the images do not tell, or the given lights fit about as well.
+    """Return refined lights; None if the images do not determine them, or the given lights fit about as well.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.

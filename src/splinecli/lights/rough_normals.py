@@ -5,9 +5,9 @@ well as right ones. But normals of a surface have no curl (Horn, "Shape from sha
 Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
 1981).
 
-Tell bumps from hollows by the shadows that a surface casts on itself. With x and y of all lights negated, the normals
-are those of the surface turned inside out. It has the same shading and the same attached shadows (Belhumeur, Kriegman
-and Yuille, IJCV 1999), but it casts shadows in other places.
+Distinguish bumps from hollows by the shadows that a surface casts on itself. Negating x and y of all lights gives the
+normals of the surface with its depth inverted. It has the same shading and the same attached shadows (Belhumeur,
+Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
-STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
+STEEP_Z = 0.7  # a rim pixel is considered steep if its normal is at least 45 degrees from the viewing direction
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
 _FITS = 5  # weighted fits to a pixel
 _TURNED_PIXELS = 2000
@@ -59,7 +59,7 @@ class RoughNormals:
         """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the least curl.
 
         They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A rotation by 180 degrees
-        more has the same curl. NaN where there are too few pixels.
+        more has the same curl. NaN if the mask has too few pixels.
         """
         if (found := self._derivatives_inside()) is None:
             return float("nan")
@@ -138,7 +138,7 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
 
 
 def _outward(mask: Bools) -> Doubles:
-    """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
+    """Return unit vectors (h, w, 2) out of the mask at its rim, leaving out the border of the image."""
     from scipy.ndimage import distance_transform_edt
 
     padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
@@ -165,8 +165,8 @@ def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
 
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
-"""From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
-reading has at most the second part of it."""
+"""Lights are doubted if at least the first share of the lit observations should be in cast shadow but are not, and the
+other reading has at most the second part of that share."""
 
 
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
@@ -183,7 +183,7 @@ class Shadows:
 
     def evidence(self, other: Shadows) -> float:
         """Return the evidence for another reading against this one, as an advantage of light_check.py."""
-        # Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9
+        # Weight of a difference of agreements, relative to light_check.py. Synthetic bumps agree by 0.2 to 0.9
         # with right lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01.
         found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
@@ -193,7 +193,7 @@ class Shadows:
         return found
 
     def leaves_open(self, other: Shadows) -> bool:
-        """Return whether shadows that this reading needs are missing, more than those of another one."""
+        """Return whether this reading predicts shadows that are missing, more than another one does."""
         # The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images
         # were rendered without cast shadows, which is not evidence against the lights.
         return self.missing > 0.01 and other.missing < 0.75 * self.missing

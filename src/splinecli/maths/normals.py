@@ -2,7 +2,7 @@
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
-Slopes and curvatures need no integration, so there is no drift and no tears. For a surface z(x, y) with unit normals n
+Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y) with unit normals n
 = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of (nx, ny) by x and y. Its determinant is
 the Gaussian curvature, because normals turn by as much as the surface does (Gauss), and half its trace is the mean
 curvature (do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).

@@ -48,7 +48,7 @@ class MethodOptions:
 class Method:
     """A row of METHODS.
 
-    make: returns the estimator from the method's name and its options, and imports what is heavy.
+    make: returns the estimator from the method's name and its options, and does the heavy imports.
     principle, source: for the documentation; without a source, the method is splinecli's own.
     observation_maps: whether figures of evaluations can show its observation maps.
     """

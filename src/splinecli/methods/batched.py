@@ -162,7 +162,7 @@ class NetworkEstimator(Estimator):
     def bind(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
         """Return this estimator with the context of one capture, from a sample of its pixels; see Estimator.
 
-        Without it, the pixels of each call of `estimate` count as a capture.
+        Without it, each call of `estimate` treats its pixels as a capture of their own.
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self

@@ -1,9 +1,9 @@
 """An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
 
-One capture has one set of lights and a few materials, so most of its pixels say the same. Under near lamps, the lights
-change smoothly over the image. The network estimates a sample of them, the perceptron learns it and estimates the rest
-at some 80 times the speed. What the perceptron does not follow is mostly the network's noise (Hinton, Vinyals and Dean,
-Distilling the knowledge in a neural network, arXiv 1503.02531).
+One capture has one set of lights and a few materials, so most of its pixels are redundant. Under near lamps, the lights
+change smoothly over the image. The network estimates a sample of the pixels, and the perceptron learns from this sample
+and estimates the rest about 80 times as fast. The part that the perceptron does not follow is mostly the network's
+noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
     Args:
         features: (P, C) of the pixels that may be drawn, in any order.
         generator: on the CPU.
-        rare_share: largest share of the pixels in groups that count as rare.
+        rare_share: largest share of the pixels in groups that are considered rare.
     """
     order = torch.randperm(len(features), generator=generator)
     size = min(size, len(features) // 2)
@@ -214,7 +214,7 @@ _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
 
 @dataclass(frozen=True)
 class Distillation:
-    """What was learned, and how well."""
+    """The learned perceptron, and how well it learned."""
 
     sample: int  # number of pixels that the network estimated for learning
     held_out: int  # number of these that were not learned. They are an even sample of the capture
@@ -313,7 +313,7 @@ def distil(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DistilledEstimator:
-    """Return an estimator for the pixels of one capture that learned from `teacher` on a sample of them.
+    """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of the pixels.
 
     The result is the same for the same seed.
 

@@ -71,7 +71,7 @@ class Estimator(ABC):
     fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
     has_confidence: whether it also estimates its own accuracy.
     tile_pixels: the number of pixels that it gets at once.
-    refiner: what corrects its map of normals by what lies around each pixel, or None.
+    refiner: corrects the map of normals, using the neighbourhood of each pixel; or None.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Estimator(ABC):
         return self.estimate(observations, light_directions, progress=progress), None
 
     def bind(self, light_of: LightOf, n_pixels: int) -> Estimator:
-        """Return the estimator for the pixels of one capture, which may have encoded a sample of them.
+        """Return the estimator for the pixels of one capture, possibly with an encoded sample as context.
 
         Args:
             light_of: gives the observations and the light directions of some pixels.
@@ -143,8 +143,8 @@ class Estimator(ABC):
 class ObservationMaps(NamedTuple):
     """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation; NaN in empty cells."""
 
-    sparse: NDArray[np.float32]  # what the network gets
-    dense: NDArray[np.float32]  # what LI-Net makes of it
+    sparse: NDArray[np.float32]  # the input of the network
+    dense: NDArray[np.float32]  # the output of LI-Net
     every: NDArray[np.float32]  # of all lights
     grid: Grid
 

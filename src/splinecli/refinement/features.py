@@ -1,4 +1,4 @@
-"""What the refinement net reads of each pixel: its estimated normal and error, and how its observations fit them."""
+"""Inputs of the refinement net for each pixel: its estimated normal and error, and how its observations fit them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def refine_features(
         normals: (P, 3), unit.
         error: (P, 2), see networks/li_ne_net.py.
         reference: the brightness of the capture, see `brightness`.
-        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
+        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/least_squares.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -78,7 +78,7 @@ def refine_features(
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
-    """Return what compare_halves finds in double precision, from observations (P, F) with a largest value of 1."""
+    """Return compare_halves in double precision, from observations (P, F) with a largest value of 1."""
     found = compare_halves(observed.double(), light_directions.double(), signs)
     return TwoHalves(*(values.to(observed) for values in found))
 
@@ -96,7 +96,7 @@ class Turn(NamedTuple):
 
     @property
     def back(self) -> Turn:
-        """The turn that undoes this one. A turned mirror image undoes itself."""
+        """The rotation that undoes this one. A rotated mirror image undoes itself."""
         return self if self.mirror else Turn(-self.quarters % 4)
 
 

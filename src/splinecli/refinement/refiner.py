@@ -1,8 +1,8 @@
 """The refinement nets on a whole capture: in tiles, and on large captures at a lower resolution.
 
-The nets learned from objects of a hundred to three hundred pixels a side. On larger maps they see less of the object,
-and their results are worse. So a large capture is halved until the nets are at home, and comes back octave by octave
-with the detail that is real; see detail.py.
+The nets were trained on objects of a hundred to three hundred pixels a side. On larger maps, their receptive field
+covers less of the object, and their results are worse. So a large capture is halved until it has the size of the
+training objects, and then enlarged octave by octave, with the detail that is real; see detail.py.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
 
 MARGIN = 112
-"""Pixels around a tile that are seen, a multiple of COARSEST.
+"""Pixels around a tile that the nets use as context, a multiple of COARSEST.
 
-Two nets can see further (RefineNet's `reach`), but what lies beyond the margin turns no normal by more than 0.01
+Two nets reach further (RefineNet's `reach`), but context beyond the margin changes no normal by more than 0.01
 degrees. A margin of 64, which is enough for one net, leaves visible seams with two.
 """
 
@@ -39,7 +39,7 @@ TILE = 512
 
 Larger tiles take less time, because their margins are smaller in all, and more memory."""
 
-MOST_PIXELS = 150_000  # the most pixels of a capture that the net sees as they are
+MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at full resolution
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 
@@ -62,7 +62,7 @@ class _Capture:
 
 @dataclass(eq=False)
 class NetworkRefiner:
-    """Corrects the normals of a capture, and the distributions of their errors, by what lies around each pixel.
+    """Corrects a capture's normals, and the distributions of their errors, using the neighbourhood of each pixel.
 
     Args:
         network: one refinement net or two, on their device.
@@ -107,7 +107,7 @@ class NetworkRefiner:
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
         """
-        middle = light_of(np.array([len(normals) // 2])).directions  # as one pixel sees the lights
+        middle = light_of(np.array([len(normals) // 2])).directions  # the lights at one pixel
         of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
         self._refine(_Capture(around_object(mask), observations, light_of, normals, errors, *of_whole), progress)
 
@@ -134,7 +134,7 @@ class NetworkRefiner:
         # The net's layers are large enough for all cores.
         run = map if half is None else side_by_side
         for pixels, tiles in rows_of_tiles(capture.mask, self.tile, margin):
-            return_freed_memory()  # what the tiles above left is in pieces
+            return_freed_memory()  # the freed memory of the tiles above is fragmented
             band = Band(pixels, *whole)
             for own, refined, errors in run(refine, tiles):
                 # Nothing is known of a pixel that is dark under every light.
@@ -148,7 +148,7 @@ class NetworkRefiner:
         above.write()
 
     def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile, as the net sees them."""
+        """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged over rotations."""
 
         def features_of(rows: Rows, light: LampLight, _: slice) -> torch.Tensor:
             return refine_features(
@@ -171,7 +171,7 @@ class NetworkRefiner:
         return normals, errors
 
     def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: those of the half capture, with detail."""
+        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's, with detail."""
         smooth, errors = half.enlarged(tile.box)
         inside = smooth[:, torch.from_numpy(tile.mask)].T.numpy()
         errors = errors[:, *seen].to(self._device)

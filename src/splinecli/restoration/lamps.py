@@ -6,7 +6,7 @@ here (normals, then intensities) is robust: it uses least absolute deviations an
 
 The colours of lamps, where they differ from image to image. A matte pixel has a colour of its own, and each lamp
 changes it by the same factors everywhere: R_pf = e_f^R a_p^R s_pf, and so on. Averaged over the channels, a red pixel
-then looks darker under a green lamp, as if it were turned away. The factors are found from the medians of the colours'
+then looks darker under a green lamp, as if it were facing away. The factors are found from the medians of the colours'
 changes, and each channel is divided by its own.
 """
 
@@ -128,15 +128,15 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     if spread_of(normals) >= FLAT_SPREAD:
         return intensities
     directions, shown = _shown(intensities, normals, lights)
-    # How unequal the intensities are is measured where a tilt cannot explain it. Otherwise a tilt would count as
-    # inequality, and the more tilted an object is, the less its tilt would be believed.
+    # The inequality of the intensities is measured on the part that a tilt cannot explain. Otherwise a tilt would be
+    # mistaken for inequality, and a strongly tilted object would get too weak a tilt.
     tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
     tilt = _fit_tilt(shown, directions, max(_variance(shown, directions, tilt), _LEAST_VARIANCE))
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 
 def _shown(intensities: Doubles, normals: Doubles, lights: Doubles) -> tuple[Doubles, Doubles]:
-    """Return unit directions (F, 3), and what a plane with the mean normal shows under each light (F,)."""
+    """Return unit directions (F, 3), and the brightness (F,) of a plane with the mean normal under each light."""
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
     return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
@@ -153,18 +153,18 @@ def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -
 
 
 def _variance(shown: Doubles, directions: Doubles, tilt: Doubles) -> float:
-    """Return the variance of the log intensities, from what no tilt explains."""
+    """Return the variance of the log intensities that a tilt does not explain."""
     return float((_inequality(shown, directions, tilt) ** 2).sum()) / max(len(shown) - 3, 1)
 
 
 def _inequality(shown: Doubles, directions: Doubles, tilt: Doubles) -> Doubles:
-    """Return the logarithms (F,) of the intensities that a plane with this tilt needs to show what it does, mean 0."""
+    """Return the log intensities (F,), mean 0, that give a plane with this tilt the observed brightness."""
     unequal = np.log(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
     return np.asarray(unequal - unequal.mean())
 
 
 def _fit_tilt(shown: Doubles, directions: Doubles, variance: float) -> Doubles:
-    """Return the likeliest tilt (2,) of a plane if log intensities have this variance, and the tilt that of TILT."""
+    """Return the likeliest tilt (2,) of a plane, for log intensities of this variance and tilts of variance TILT^2."""
     tilt, certainty = np.zeros(2), TILT**2 / variance
     for _ in range(_TILT_FITS):
         slopes = directions[:, :2] / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)[:, None]

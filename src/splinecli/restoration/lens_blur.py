@@ -1,4 +1,4 @@
-"""What lens and Bayer pattern took from the images of a capture: how wide their blur is, and observations without it.
+"""Blur by the lens and the Bayer pattern: how wide it is in the images of a capture, and observations without it.
 
 A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because it fills shadows,
 flattens highlights and mixes the outline with the background. Its width is estimated from the images alone: edges of
@@ -24,12 +24,12 @@ SMALLEST_SIGMA = 0.4
 WIDEST_SIGMA = 1.2  # the widest one of the captures to which the estimate was fitted
 
 NOISE = 0.005
-"""Mean power of the noise over that of the images. Chosen on rendered captures with noise, 8 bits and JPEG."""
+"""Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG."""
 
 _MOST_IMAGES = 12
 _OUTLINE = 4  # pixels around the object whose steps are looked at
 _SQUARES, _SIDE = 16, 128  # of a capture that has more pixels, only so many squares are looked at
-_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that count as edges
+_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that are treated as edges
 _FEWEST_EDGES = 60
 _CORRELATION_ERROR = 0.1
 _SMOOTHEST = 0.5
@@ -117,8 +117,8 @@ def _widest_at(correlation: float) -> float:
 def inverse_filter(sigma: float) -> Singles:
     """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
 
-    Of all filters of this size it has the least mean square error (Wiener's criterion) for images whose power falls
-    with the square of the frequency, as that of edges does, and white noise.
+    Of all filters of this size it has the least mean square error (Wiener's criterion) for white noise and images whose
+    power falls with the square of the frequency, as it does for edges.
     """
     frequencies = np.arange(33) / 64
     places = np.arange(REACH + 1)
@@ -135,7 +135,7 @@ def inverse_filter(sigma: float) -> Singles:
 
 
 def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles | None:
-    """Return five numbers (5,) that tell how sharp the images of a capture are, or None if they have too few edges.
+    """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too few edges.
 
     Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
     lower and the upper quartile over the steepest ones. A step between two pixels has 1; behind a blur of 0.7 pixels,
