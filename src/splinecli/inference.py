@@ -3,7 +3,7 @@
 The surface that decides from where, and how strongly, each near lamp lights each pixel. Fit normals, integrate them,
 move the pixels onto the surface, and fit again with the light directions and the inverse-square falloff that the lamps
 have there. The surface begins as the object's mean plane. (Logothetis et al., "A CNN based approach for the point-light
-photometric stereo problem", arXiv 2210.04655, alternate alike.)
+photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
 
 Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
@@ -34,14 +34,14 @@ from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
 
-METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
+METHOD = "iw12"  # the intermediate fit: fast, and robust against shadows and highlights
 
 PIXELS_ON_THE_WAY = 40_000
-"""Larger captures are fitted on the way at about this size: fine detail hardly moves the surface."""
+"""Larger captures are fitted at about this size in between: fine detail hardly moves the surface."""
 
 
 def find_surface(capture: Capture) -> Capture:
-    """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is."""
+    """Return the capture with the points of its surface. With points already, or distant lights, it is unchanged."""
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
@@ -49,7 +49,7 @@ def find_surface(capture: Capture) -> Capture:
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
-    # Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are
+    # Intermediate fits. An error of the surface only matters as a share of the distance of the lamps, so few are
     # enough.
     for _ in range(2):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
@@ -80,7 +80,7 @@ class NormalEstimate:
     errors: summary of error_map_deg, or None.
     confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG; zero outside the
         mask. None if the method has no confidence.
-    capture_judged: whether the confidence also says how well the whole capture fits its lights and its values.
+    capture_judged: whether the confidence also covers how well the whole capture fits its lights and its values.
     """
 
     capture: Capture
@@ -143,7 +143,7 @@ def estimate_normals(
 def _estimate(
     capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
-    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether they judge the whole capture.
+    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
     Methods without confidence have no distributions.
     """
@@ -193,7 +193,7 @@ def estimate_pixels(
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
-        light_without: gives the light of some pixels without indirect light, or with all that there is.
+        light_without: gives the light of some pixels without the given indirect light; None removes nothing.
         tile_pixels, progress, stage: see estimate_normals.
     """
     tile_pixels = tile_pixels or estimator.tile_pixels

@@ -81,7 +81,7 @@ def unit_rays(points: Doubles, matrix: Doubles) -> Doubles:
 def find_view(image: ImageFacts, matrix: Path | None) -> View:
     """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
 
-    Raises InputError where the file or the image cannot be read, or the file has no camera matrix.
+    Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
     """
     height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
@@ -156,7 +156,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
 
 
 def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
-    """Return the centre (3,) of a ball whose outline a camera sees at image points (N, 2).
+    """Return the centre (3,) of a ball whose outline is at these image points (N, 2) of a camera.
 
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
     linear. Written with m_z + 1, it is also exact for a camera that is far away.

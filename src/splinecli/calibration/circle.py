@@ -127,7 +127,7 @@ def _merit(circle: Circle) -> float:
 
 
 def _refine(values: Singles, guess: Circle) -> Circle | None:
-    """Return the circle through the strongest edges along rays from the guess's centre; None where too few agree."""
+    """Return the circle through the strongest edges along rays from the guess's centre; None if too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
         steps = np.arange(guess.radius - half, guess.radius + half, 0.5)
@@ -142,7 +142,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
         # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
-        clear = strength > 0.01  # weakest edge that counts
+        clear = strength > 0.01  # weakest edge that is used
         if clear.sum() < 0.2 * RAYS:
             return None
         points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
@@ -187,7 +187,7 @@ def _fit(points: Doubles, *, outline_points: int) -> Circle:
 
 
 def _through(three: Doubles) -> tuple[float, float, float] | None:
-    """Return x, y and radius of the circle through three points (3, 2), or None where they are in line."""
+    """Return x, y and radius of the circle through three points (3, 2), or None if they are collinear."""
     (ax, ay), (bx, by), (cx, cy) = three
     twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
     if abs(twice_area) < 1e-9:

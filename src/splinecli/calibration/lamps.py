@@ -107,8 +107,8 @@ def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) ->
 PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
 HEIGHT_SPREAD = 0.5
-"""Usual difference between the heights of the balls' centres and their plane, in radii. It decides where the size of
-the outlines does not: under a distant camera."""
+"""Usual difference between the heights of the balls' centres and their plane, in radii. It matters under a distant
+camera, where the size of the outlines does not determine the heights."""
 
 CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
@@ -119,7 +119,7 @@ class LampPositions:
 
     positions: Doubles  # (F, 3)
     uncertainty: Doubles  # (F,), the distance within which the true position is with CONFIDENCE
-    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel
+    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
     view: View
 
     @property
@@ -131,7 +131,7 @@ class LampPositions:
 
 
 def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
-    """Return the positions of the lamps from balls that one camera photographed; None for balls at one place.
+    """Return the positions of the lamps from balls photographed by one camera; None for balls at one place.
 
     The uncertainty comes from repeating the computation with other pixels (PIXEL_ERROR), heights of the balls and
     cameras (View.draw). It is larger if the rays miss each other by more than this explains.
@@ -200,7 +200,7 @@ def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float
     # Projections across each ray: their sum is singular for parallel rays.
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     weights = np.ones(starts.shape[:2])
-    # An error of direction counts in proportion to the distance, which is not known at first.
+    # An error of direction is weighted in proportion to the distance, which is not known at first.
     for _ in range(3):
         weighted = across * weights[..., None, None]
         right_side = np.einsum("bfij,bfj->fi", weighted, starts)
@@ -223,7 +223,7 @@ def calibration_report(
     """Return the report of a calibration as values for JSON, with its warnings.
 
     Args:
-        intensities: (F, 3), or None where they were not measured.
+        intensities: (F, 3), or None if they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.
     """

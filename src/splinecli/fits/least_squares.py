@@ -163,7 +163,7 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
     albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
     normals = scaled / albedo
     signed = (observations - dot(scaled, light_directions)) * signs
-    # The signs have a part that some normal explains, to which residuals are perpendicular. Only the rest sees noise.
+    # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest measures noise.
     signs = signs.to(scaled).expand(1 if light_directions.ndim == 2 else len(scaled), -1)
     seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
     along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
@@ -175,7 +175,7 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
 def alternating_signs(light_directions: Tensor) -> Tensor:
     """Return 1 and -1 in turn (F,) for lights (F, 3) in the order of their azimuths about the middle one.
 
-    The light furthest from the middle has 1. So neither the order of the lights nor a turn of the image changes the
+    The light furthest from the middle has 1. So neither the order of the lights nor a rotation of the image changes the
     halves, unless two lights have the same direction or distance.
     """
     across = light_directions[:, :2] - light_directions[:, :2].mean(dim=0)

@@ -122,7 +122,7 @@ def fit_robustly(
 def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Doubles]:
     """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
 
-    Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.
+    Pixels below dark_share of the brightest hundredth are treated as dark, for example the background without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

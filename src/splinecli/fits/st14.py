@@ -156,7 +156,7 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     residual = problem.intensities[..., None] - design @ coefficients
     squares = residual.square().sum(dim=(1, 2))
 
-    # The number of well determined parameters (MacKay). The two angles of the normal always count.
+    # The number of well-determined parameters (MacKay). The two angles of the normal are always included.
     slack = (prior * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2)).sum(dim=1)
     freedom = (problem.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
 

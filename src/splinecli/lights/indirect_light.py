@@ -5,8 +5,9 @@ is as bright from all sides. Estimated normals give the surface. Together they g
 from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV
 1991, also alternate between the shape and the light on it.)
 
-Two things are unknown: the exposure, that is which observation an albedo of 1 gives, and whether the object is matte
-enough. Attached shadows show both. Under a light behind its tangent plane, a pixel shows indirect light alone.
+Two things are unknown: the exposure, that is the observation for an albedo of 1, and whether the object is matte
+enough. Attached shadows show both, because a pixel reflects only indirect light if the lamp is behind its tangent
+plane.
 """
 
 from dataclasses import dataclass, replace
@@ -70,7 +71,7 @@ class IndirectLight:
 def find_indirect_light(
     mask: Bools, observations: Singles, light_of: LightOf, normals: Singles
 ) -> IndirectLight | None:
-    """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
+    """Return the indirect light of a capture, or None if the attached shadows show none that could be removed.
 
     The camera is always treated as orthographic, because only nearby parts exchange much light.
 
@@ -97,7 +98,7 @@ def find_indirect_light(
     def sum_up(rows: Rows) -> Doubles:
         rows = rows[lit[rows]]
         # A block sends at most this many times the light of a matte one that faces the lamp. The rest is a
-        # highlight, which goes another way.
+        # highlight, which goes in another direction.
         most = 3.0 * albedo[rows, None]
         sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
@@ -120,10 +121,10 @@ def find_indirect_light(
 
 
 def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Singles:
-    """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
+    """Return the light (p, F) that arrives at each block from the others, relative to the light a white one reflects.
 
-    Nothing between two blocks hides them from each other. `covered` (p,) is the share of each block that the mask
-    covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
+    Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask covers, `normals`
+    (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
     normal_map = np.zeros((*blocks.mask.shape, 3))
     normal_map[blocks.mask] = normals
@@ -131,7 +132,7 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
-    # Half a side of a block is added, because neighbours are not only their middles.
+    # Add half the side of a block, because neighbours exchange light over their whole area, not only their centres.
     square = np.square(towards).sum(axis=-1) + 0.5**2
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
@@ -168,7 +169,7 @@ def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf,
     if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
-    # More alike, gathered and ambient light cannot be separated.
+    # If gathered and ambient light are more alike, they cannot be separated.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
         with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure

@@ -2,14 +2,14 @@
 
 The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
 (Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
-factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
-Lights in a wrong order are not.
+factors are found without the lights. Correct lights are linear combinations of these factors in any frame. Lights in a
+wrong order are not.
 
 To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is
 linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a
 prior around the given ones. The prior fixes the remaining freedom: lights and normals may rotate together. If the
-light intensities are known, nothing else is open. If not, a prior on them holds the generalised bas-relief ambiguity
-(Belhumeur, Kriegman and Yuille, IJCV 1999).
+light intensities are known, no other freedom remains. If not, a prior on them fixes the generalised bas-relief
+ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are tr
 MIN_PIXELS_PER_LIGHT = 10
 
 MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
-INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
+INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, if none were measured
 
 
 _ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
@@ -97,7 +97,7 @@ class Factors:
 def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
     """Return the factors of observations (P, F), or None if too few of them are lit.
 
-    Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
+    Shadows are left out, and highlights get small weights: least absolute deviations, by weighted least squares.
     """
     values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
@@ -163,8 +163,8 @@ def fit_residual(values: Doubles, light_directions: Doubles) -> float:
 def sample_pixels(observations: Floats) -> Doubles:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
-    # Pixels below this share of the brightest hundredth are left out: background. The second counts where too few
-    # are left by the first, because highlights outshine the object.
+    # Pixels below this share of the brightest hundredth are left out as background. The second share is used if the
+    # first leaves too few, because highlights outshine the object.
     for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
@@ -178,7 +178,7 @@ LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
 
 LARGEST_LIGHT_ERROR_DEG = 30.0
 
-MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
 
 
 MAX_MISFIT = 0.018
@@ -186,7 +186,7 @@ MAX_MISFIT = 0.018
 have more, and a matte model would move their lights wrongly."""
 
 
-INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
+INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
 
 _MIN_PIXELS = 100
 _WORTH_PIXELS = 50.0  # see fit_near
@@ -206,7 +206,7 @@ class LightFit(NamedTuple):
 
     @property
     def fit_ratio(self) -> float:
-        """The median residual, as a share of that under the given lights."""
+        """The median residual, as a share of the median residual under the given lights."""
         return self.after / max(self.before, 1e-12)
 
 
@@ -255,7 +255,7 @@ def would_refine(observations: Floats, factors: Factors | None, light_directions
     # be suggested. Few matte or shiny captures with exact lights exceed it.
     if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
-    # Intensities that nobody measured are not the fault of the directions.
+    # The directions are not to blame for unmeasured intensities.
     intensities = factors.intensities(light_directions[None])[0]
     return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
 
@@ -383,7 +383,7 @@ def _move_lights(
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()
-    # A light that no pixel shows keeps its given vector.
+    # A light that does not reach any pixel keeps its given vector.
     scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
     curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
     gradient = ((weights * residuals).T @ normals) * scale[:, None]

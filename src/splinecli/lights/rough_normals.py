@@ -1,7 +1,7 @@
 """Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows, by cast shadows.
 
 Evidence on the frame of light directions, from the normals that they give. Lights in a wrong frame fit the images as
-well as right ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
+well as correct ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
 Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
 1981).
 
@@ -251,7 +251,7 @@ def cast_shadows(heights: Doubles, lights: Doubles) -> Bools:
     cast = np.zeros((height, width, len(lights)), np.bool_)
     for place, (x, y, z) in enumerate(lights):
         level = float(np.hypot(x, y))
-        # A ray that has climbed by the whole relief meets nothing.
+        # A ray that has climbed by the whole relief cannot be blocked any more.
         longest = max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
         for step in range(2, longest if level > 0 else 0):
             down, right = round(-y / level * step), round(x / level * step)

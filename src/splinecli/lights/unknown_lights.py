@@ -173,7 +173,7 @@ def turn_at_outline(
     turn = Rotation.identity()
     for _ in range(_ROUNDS):
         turned = turn.apply(normals)
-        # A small turn w adds w x n. The first residual is along the view axis, the second along the outline.
+        # A small rotation w adds w x n. The first residual is along the view axis, the second along the outline.
         residuals = np.stack((turned[:, 2] - _RIM_Z, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
         weights = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
@@ -223,12 +223,12 @@ def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_direc
 
 
 LARGEST_ERROR_DEG = 20.0
-"""Lights with a larger expected error on average are refused: their normals would be worth little."""
+"""Lights with a larger expected error on average are refused, because their normals would be of little use."""
 
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near
-# Log odds that the network takes a bump for a bump: fewer where it expects larger errors.
+# Log odds that the network does not confuse bumps with hollows: lower if it expects larger errors.
 _MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
 # Mean error of the returned lights, from the error that the network expects, fitted on 720 rendered captures with and
 # without an outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
@@ -300,7 +300,7 @@ def find_lights(
     turn = turn_at_outline(observations, mask, directions)
     if turn is not None and turn.spread < 0.2:  # outlines of larger spread are ignored
         # The part of a larger rotation beyond twice the expected error comes from the mouth of a vessel.
-        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the turn that it shows
+        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the rotation that it shows
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
@@ -321,7 +321,7 @@ def find_lights(
 def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.float64]:
     """Return the directions (F, 3), or those with opposite x and y, whichever has the first light on this side.
 
-    Raises InputError where it is on neither side clearly.
+    Raises InputError if it is not clearly on either side.
     """
     azimuth = math.radians(azimuth_of(first_light))
     towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
@@ -334,11 +334,11 @@ def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.fl
 
 
 def _check_different(observations: NDArray[np.float32]) -> None:
-    """Raise InputError for images that show no change of the light."""
+    """Raise InputError if the light does not change between the images."""
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
-    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
+    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is not a change of the light
     mean = rows.mean(axis=1, keepdims=True)
-    # Images that differ by less from their mean show no light that moves.
+    # Images that differ by less from their mean do not show a moving light.
     if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
         problem = "all images are alike, so they say nothing about the lights"
         raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
@@ -349,7 +349,7 @@ def _ask_network(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
 
-    They are means over the four turns of the images by 90 degrees and their mirror images.
+    They are means over the four rotations of the images by 90 degrees and their mirror images.
     """
     area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
     small = []

@@ -14,7 +14,7 @@ from splinecli.maths import Doubles
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
 AUTOMATIC = "auto"
-"""Use the curve that the images state: a colour profile's curve, sRGB for JPEG or tagged PNG, linear for others."""
+"""The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states it; else linear."""
 
 TransferCurve = float | tuple[float, ...] | None
 """An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1."""
@@ -82,7 +82,7 @@ _SAME = 1e-3  # difference of linear values below which two curves are considere
 
 @lru_cache(maxsize=4)
 def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
-    """Return the name and the curve of a profile; None for one that is damaged or has no single curve."""
+    """Return the name and the curve of a profile; None if it is damaged or has no single curve."""
     try:
         tags = _tags(profile)
         curves = [_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
@@ -106,7 +106,7 @@ def _tags(profile: bytes) -> dict[bytes, bytes]:
 
 
 def _curve(tag: bytes) -> TransferCurve:
-    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error for no usable curve."""
+    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error if it has no usable curve."""
     stored = np.linspace(0, 1, _SAMPLES)
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)

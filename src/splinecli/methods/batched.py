@@ -39,7 +39,7 @@ The normals may have any length, 0 for a pixel that has none. All observations a
 class BatchedEstimator(Estimator):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
-    Each pixel is first divided by its largest observation. Thresholds and priors then mean the same for dark and bright
+    Each pixel is first divided by its largest observation. Thresholds and priors are thereby equal for dark and bright
     pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
     """
 
@@ -111,7 +111,7 @@ def estimate_in_batches(
 
 Precision = Literal["float32", "bfloat16"]
 
-_CANDIDATES = 4096  # pixels from which those are chosen that the others see
+_CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 
 ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
@@ -152,11 +152,11 @@ class NetworkEstimator(Estimator):
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if rotations > 1 and self.network.config.sees_capture:
-            self.fingerprint += " of the capture, too"  # trials of before, when they saw one context, do not fit
+            self.fingerprint += " of the capture, too"  # older trials used one context for all rotations
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
-        self._contexts: list[CaptureContext | None] = [None] * rotations  # as each rotation shows the capture
+        self._contexts: list[CaptureContext | None] = [None] * rotations  # the capture's context in each rotation
 
     @torch.no_grad()
     def bind(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:

@@ -50,7 +50,7 @@ class PixelSample:
     def unlike(self, features: Tensor) -> Tensor:
         """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
         from_rare, from_others = (_nearest(features, self.centres[group]) for group in (self.rare, ~self.rare))
-        # Rounding must not make a pixel unlike itself.
+        # Rounding must not make a pixel of the sample unlike itself.
         return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
 
 
@@ -143,13 +143,13 @@ class Perceptron(nn.Module):
         for layer in (*hidden, self.last):
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
             nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.last.weight)  # learning begins at least squares
+        nn.init.zeros_(self.last.weight)  # training starts from least squares
         self.hidden = nn.Sequential(*(part for layer in hidden for part in (layer, nn.ReLU())))
 
     def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
         """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3).
 
-        Between them stands the mean direction (P, 3) of lights (P, F, 3), because it says where a pixel is.
+        The mean direction (P, 3) of lights (P, F, 3) is placed between them, because it encodes the pixel's position.
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
@@ -224,8 +224,8 @@ class Distillation:
 
     @property
     def is_good(self) -> bool:
-        """Whether the perceptron follows the network as closely as the network's own errors deserve."""
-        # On rendered pixels, more cost 0.3 degrees and more against the truth.
+        """Whether the perceptron follows the network closely enough, compared with the network's own errors."""
+        # On rendered pixels, a larger share increased the error against the truth by 0.3 degrees or more.
         return self.mean_deg <= 0.7 * self.expected_deg
 
 

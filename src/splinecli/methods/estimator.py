@@ -37,9 +37,9 @@ class StudentSize:
 
 
 def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
-    """Return the usual size for a capture of n_pixels, and the size where that one is not enough.
+    """Return the usual size for a capture of n_pixels, and the size to use if that is not enough.
 
-    Each pixel of the sample is learned some 25 times.
+    The training visits each pixel of the sample about 25 times.
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
@@ -49,7 +49,7 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
 Directions = NDArray[np.floating]
-"""(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
+"""(F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
 the camera."""
 
 
@@ -152,7 +152,7 @@ class ObservationMaps(NamedTuple):
 CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
-"""The distribution of the error of a normal that nothing is known of. Its confidence is 0."""
+"""The distribution of the error of an unknown normal. Its confidence is 0."""
 
 
 def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:

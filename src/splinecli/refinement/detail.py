@@ -39,7 +39,7 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
     Returns:
         Unit normals (3, H, W), zero outside the mask. Black pixels stay as they are.
     """
-    mask = mask * least_squares.any(dim=0)  # black pixels show nothing
+    mask = mask * least_squares.any(dim=0)  # black pixels carry no information
     removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
     alike = _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
     return unit_maps(refined + _real_share(missing, noise) * alike * removed)
@@ -57,7 +57,7 @@ def restore_octave(
     Args:
         enlarged: (3, H, W), unit, from half the resolution.
         estimated, least_squares, noise, mask: see restore_detail. The maps begin at even rows and columns.
-        largest: (1, H, W), the largest observation of each pixel. Bright pixels show more than dark ones.
+        largest: (1, H, W), the largest observation of each pixel. Bright pixels get more weight than dark ones.
 
     Returns:
         Unit normals (3, H, W), zero outside the mask.

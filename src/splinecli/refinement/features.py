@@ -20,7 +20,7 @@ from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
 
 _LARGEST_LOG = 4.0
-_HALVES_SCALE = 3.0  # brings these small numbers near the others
+_HALVES_SCALE = 3.0  # scales these small numbers to the range of the others
 
 
 @torch.no_grad()
@@ -89,7 +89,7 @@ def brightness(observations: Tensor) -> float:
 
 
 class Turn(NamedTuple):
-    """A mirror image (x is flipped) if `mirror`, then a turn counterclockwise by `quarters` of 360 degrees."""
+    """A mirror image (x is flipped) if `mirror`, then `quarters` counterclockwise rotations by 90 degrees."""
 
     quarters: int
     mirror: bool = False
@@ -101,14 +101,14 @@ class Turn(NamedTuple):
 
 
 def turn_features(features: Tensor, turn: Turn) -> Tensor:
-    """Turn maps of features (..., CHANNELS, H, W)."""
+    """Rotate maps of features (..., CHANNELS, H, W)."""
     return turn_maps(features, turn, VECTORS, (TENSOR,))
 
 
 def turn_maps(
     maps: Tensor, turn: Turn, vectors: Sequence[tuple[int, int]] = (), tensors: Sequence[tuple[int, int, int]] = ()
 ) -> Tensor:
-    """Turn maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
+    """Rotate maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
     if turn.mirror:
         maps = maps.flip(-1)
         for odd in (*(x for x, _ in vectors), *(xy for _, _, xy in tensors)):

@@ -35,9 +35,9 @@ degrees. A margin of 64, which is enough for one net, leaves visible seams with 
 """
 
 TILE = 512
-"""Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin comes on top.
+"""Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin.
 
-Larger tiles take less time, because their margins are smaller in all, and more memory."""
+Larger tiles take less time, because their margins are smaller in total, but more memory."""
 
 MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at full resolution
 
@@ -67,10 +67,10 @@ class NetworkRefiner:
     Args:
         network: one refinement net or two, on their device.
         precision: the number format of the convolutions.
-        turns: the results of this many quarter turns of the map are averaged. Mirror images gain nothing beside them.
+        turns: the results of this many quarter turns of the map are averaged. Adding mirror images does not help.
         tile, margin: see TILE and MARGIN. With a margin of the net's `reach`, tiles change nothing.
-        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real; the net
-            sees their maps as they are, on more pixels once rather than in all turns.
+        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real, so the net
+            processes their maps at full resolution: more pixels, but once instead of in all turns.
     """
 
     network: RefineNet
@@ -102,7 +102,7 @@ class NetworkRefiner:
 
         Args:
             mask: (H, W), with P true pixels.
-            observations: (P, F); only their brightness counts here.
+            observations: (P, F); only their brightness is used here.
             light_of: gives the observations and the light directions of some pixels.
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
@@ -224,7 +224,7 @@ class NetworkRefiner:
 
 
 def _turn_back(normals: Floats, rows: Rows, light_of: LightOf) -> None:
-    """Turn normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
+    """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
     for start in range(0, len(rows), LIT_AT_ONCE):
         part = slice(start, start + LIT_AT_ONCE)
         light = light_of(rows[part])

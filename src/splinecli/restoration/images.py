@@ -153,7 +153,7 @@ class Saturation:
     given: float | None = None  # the white level that the user gave; None to find it
     # the pixels whose observations are wanted; None for all. The level is decided from all pixels
     rows: Integers | None = None
-    even: bool = False  # whether the images show an even target, of which one image may be clipped, and all of it
+    even: bool = False  # whether the images show an even target; a single image of it may be clipped, even completely
 
     @property
     def white_level(self) -> WhiteLevel | None:
@@ -219,7 +219,7 @@ class Saturation:
         return WhiteLevel(float(full_scale), "full scale"), saturated
 
     def _stated_level(self, maximum: int) -> int | None:
-        # PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
+        # PNG requires values that are shifted to fill 16 bits. Many programs store them unshifted.
         levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
@@ -281,7 +281,7 @@ def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[n
     """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
     lowest_compared = math.ceil(LOWEST_COMPARED * maximum)
     values = pixels.reshape(-1)
-    # Few values are near the maximum. The others are counted only where these are not enough.
+    # Few values are near the maximum. The others are counted only if these are not enough.
     for lowest in (max(lowest_compared, maximum - _NEAR), lowest_compared):
         counts = np.zeros(maximum + 1 - lowest, np.int64)
         for start in range(0, len(values), _BLOCK):

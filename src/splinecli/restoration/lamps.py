@@ -28,11 +28,11 @@ MIN_LIGHTS = 6
 wrong."""
 
 FLAT_SPREAD = 0.35
-"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, as a coin or a
-painting. There, a tilt of all normals together looks like other intensities, so the tilt is the likeliest one."""
+"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, such as a coin or a
+painting. Tilting all its normals together has the same effect as other intensities, so the likeliest tilt is used."""
 
 TILT = 0.09  # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
-_TRUSTED_TILTS = 1.5  # times TILT: where equal intensities turn a flat object by less than that, they stay
+_TRUSTED_TILTS = 1.5  # times TILT: if equal intensities tilt a flat object by less than that, they are kept
 MAX_ERROR_RATIO = 0.35  # largest accepted residual, as a share of the residual under equal intensities
 
 MAX_ERROR = 0.035
@@ -61,7 +61,7 @@ def estimate_light_intensities(observations: Singles, missing: Bools | None, lig
 
     Args:
         observations: (P, F), not divided by intensities.
-        missing: (P, F), observations that do not count, such as saturated ones.
+        missing: (P, F), observations to leave out, such as saturated ones.
         lights: (F, 3), or a function from rows (p,) to (p, F, 3), as under near lamps.
     """
     chosen = _choose_pixels(observations, missing)
@@ -85,7 +85,7 @@ def estimate_light_intensities(observations: Singles, missing: Bools | None, lig
 
 
 def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArray[np.intp], Doubles, Bools] | None:
-    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them count.
+    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them to use.
 
     Returns None for too few.
     """
@@ -99,7 +99,7 @@ def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArra
 
 
 def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None:
-    """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
+    """Return the intensities (F,) at which fits and medians agree; None if a light reaches too few pixels."""
     intensities = np.ones(values.shape[1])
     for _ in range(_MAX_ROUNDS):
         scaled_normals = _fit(values, known, intensities, lights)

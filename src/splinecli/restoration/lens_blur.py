@@ -21,14 +21,14 @@ REACH = 6
 SMALLEST_SIGMA = 0.4
 """A narrower blur is left alone: it costs little, and its estimate is wrong by 0.1 to 0.2 pixels."""
 
-WIDEST_SIGMA = 1.2  # the widest one of the captures to which the estimate was fitted
+WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
 
 NOISE = 0.005
 """Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG."""
 
 _MOST_IMAGES = 12
-_OUTLINE = 4  # pixels around the object whose steps are looked at
-_SQUARES, _SIDE = 16, 128  # of a capture that has more pixels, only so many squares are looked at
+_OUTLINE = 4  # pixels around the object whose steps are analysed
+_SQUARES, _SIDE = 16, 128  # a capture with more pixels is only analysed in this many squares
 _STEEP_SHARE = 0.01  # share of the local maxima of the gradient that are treated as edges
 _FEWEST_EDGES = 60
 _CORRELATION_ERROR = 0.1
@@ -59,7 +59,7 @@ def _grown(mask: Bools, reach: int) -> Bools:
 
 
 def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | None:
-    """Sharpen observations in place; return the estimated blur, or None if there is none that matters.
+    """Sharpen observations in place; return the estimated blur, or None if it is negligible.
 
     Args:
         observations: (P + R, F), of the P pixels of a mask (H, W), then of the R pixels around it, which keep their
@@ -105,8 +105,8 @@ def polynomial(numbers: Doubles, means: Doubles, deviations: Doubles) -> Doubles
 def _widest_at(correlation: float) -> float:
     """Return the widest blur at which gradients of neighbouring pixels have no more than this correlation.
 
-    Of all surfaces, one whose pixels have nothing in common has the least correlation behind a blur. Such fine texture
-    is none of the captures to which the polynomial was fitted.
+    Among surfaces behind the same blur, the correlation is lowest if the pixels are independent of each other. The
+    captures to which the polynomial was fitted do not have such fine texture.
     """
     sigmas = np.linspace(0.05, 2, 200)
     one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)  # of the values, at one and two pixels
@@ -142,8 +142,8 @@ def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles |
     it has 0.58. Then the correlation of the gradients of neighbouring pixels between different images, which noise does
     not change, and of gradients at a distance of two and three pixels in the same image.
 
-    See remove_blur for the arguments. The object and a narrow strip around it are looked at, in few images and, of a
-    large capture, in few squares. Values above the 0.95 quantile are cut, so that highlights do not decide alone.
+    See remove_blur for the arguments. The object and a narrow strip around it are analysed, in few images and, in large
+    captures, in few squares. Values above the 0.95 quantile are clipped, so that highlights do not dominate.
     """
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
     chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
@@ -194,7 +194,7 @@ def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
 
 
 def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
-    """Return the parts (y, x) of a capture that show its blur: all of it, or squares of one size."""
+    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of one size."""
     box = _box(region, 0)
     if region[box].size <= _SQUARES * _SIDE**2:
         return [box]
