@@ -1,11 +1,11 @@
 """From a Capture and an Estimator to a NormalEstimate, and the surface from which near lamps light each pixel.
 
-The surface that decides from where, and how strongly, each near lamp lights each pixel. Fit normals, integrate them,
-move the pixels onto the surface, and fit again with the light directions and the inverse-square falloff that the lamps
-have there. The surface begins as the object's mean plane. (Logothetis et al., "A CNN based approach for the point-light
-photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
+The surface determines the direction and the attenuation of each near lamp's light at each pixel. To find it, fit
+normals, integrate them, move the pixels onto the surface, and fit again with the light directions and the
+inverse-square falloff that the lamps have there. The surface begins as the object's mean plane. (Logothetis et al., "A
+CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
 
-Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
+If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
 The pixels are processed in tiles, so the working memory of a method depends on the tile size; only the results grow
 with the capture.
@@ -114,7 +114,7 @@ def estimate_normals(
     Args:
         tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
         progress: called with the number of pixels just finished, after each batch of the estimator.
-        stage: called with the name of each later stage where it begins; its function is called with the number of
+        stage: called with the name of each later stage when it begins; its function is called with the number of
             pixels just finished.
 
     Raises:

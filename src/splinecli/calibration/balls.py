@@ -1,8 +1,8 @@
 """Light directions from folders of images of mirror balls: the camera, the highlights, and the balls together.
 
-The highlight of a lamp in a mirror ball, and the light direction that follows from it. The ball's normal n at the
-highlight halves the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A
-common mistake is to use n itself as the light direction. The camera is at the origin, and the unit of length is the
+The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at the highlight halves
+the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A common mistake is to
+use n itself as the light direction. The camera is at the origin, and the unit of length is the
 radius of the ball. x is right, y up, z towards the camera.
 """
 
@@ -175,7 +175,7 @@ def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
 
 
 def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doubles, Doubles]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
     with np.errstate(invalid="ignore"):

@@ -1,6 +1,6 @@
 """Intensities of lamps from a gray target, positions of near ones from several balls, and the report of a calibration.
 
-Positions of near lamps from two or more mirror balls, by triangulation. Each ball gives a ray: from the highlight on
+Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from the highlight on
 its surface in the direction of the lamp. The balls' centres, which follow from the size of their outlines, are near a
 plane z = const, and the object's mean plane should be that plane.
 """
@@ -253,7 +253,7 @@ def calibration_report(
         else {
             "known": lamps.known,
             "positions": _rows(lamps.positions),
-            # Infinite where a lamp may be at any distance.
+            # Infinite if a lamp may be at any distance.
             "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
             "pixel_size": _round(lamps.pixel_size, 6),
         },

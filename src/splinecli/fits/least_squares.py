@@ -27,7 +27,7 @@ from splinecli.maths.observation_map import dot
 UNSHADED = 0.6
 """The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
 observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
-a metal all others are dark beside the highlight."""
+a metal all others are dark compared with the highlight."""
 
 FEWEST_LIT = 3  # number of brightest observations never treated as shadows, because a normal needs three
 
@@ -212,8 +212,8 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
 def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     """Return scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
 
-    Iteratively reweighted least squares comes close to the minimum. There, three residuals are zero. So the b of the
-    three smallest residuals is used where it is better.
+    Iteratively reweighted least squares comes close to the minimum, where three residuals are zero. So the b that
+    makes the three smallest residuals zero is used if it is better.
     """
     weight = torch.ones_like(observations)
     for step in range(50):

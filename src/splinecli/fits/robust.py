@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splinecli.maths import Doubles, Floats
 
 SMALLEST_PIVOT = 1e-12
-"""A usual limit of the pivots where the lights are unit vectors and the largest weight is about 1."""
+"""A usual limit of the pivots if the lights are unit vectors and the largest weight is about 1."""
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:

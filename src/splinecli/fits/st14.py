@@ -9,7 +9,7 @@ reflectance varies slowly. For a given normal the coefficients are linear, so on
 projection).
 
 The lowest intensities alone do not determine nine coefficients well. This module therefore differs from the paper in
-two ways. Coefficients are left out where few observations are kept (coefficient_count). All but the constant one have a
+two ways. Coefficients are left out if few observations are kept (coefficient_count). All but the constant one have a
 Gaussian prior around zero, that is, around Lambert's law. The fit also estimates the noise that the prior is weighed
 against (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
 """

@@ -73,7 +73,7 @@ class Factors:
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
 
     def intensities(self, light_directions: Doubles) -> Doubles:
-        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones where they are known."""
+        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones if they are known."""
         if self.intensities_known:
             return np.ones(light_directions.shape[:2])
         return self._fit_intensities(light_directions)[0]
@@ -211,7 +211,7 @@ class LightFit(NamedTuple):
 
 
 def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
-    """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
+    """Return the capture with refined lights, or unchanged if they do not fit much better. A warning says which.
 
     Args:
         error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
@@ -249,7 +249,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
 def would_refine(observations: Floats, factors: Factors | None, light_directions: Doubles) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
-    It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
+    It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
     # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is not tried only to
     # be suggested. Few matte or shiny captures with exact lights exceed it.
@@ -275,7 +275,7 @@ def check_distant(option: str, verb: str, *, near: bool) -> None:
 
 
 def check_light_error(error_deg: float | None, *, refines: bool) -> None:
-    """Raise UsageError for a usual error of directions that is out of range, or given where none are refined."""
+    """Raise UsageError for a usual error of directions that is out of range, or given although none are refined."""
     if error_deg is None:
         return
     if not refines:

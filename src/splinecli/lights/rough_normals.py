@@ -1,11 +1,11 @@
 """Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows, by cast shadows.
 
-Evidence on the frame of light directions, from the normals that they give. Lights in a wrong frame fit the images as
+The normals that lights give show whether the lights are in the right frame. Lights in a wrong frame fit the images as
 well as correct ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
 Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
 1981).
 
-Distinguish bumps from hollows by the shadows that a surface casts on itself. Negating x and y of all lights gives the
+The shadows that a surface casts on itself distinguish bumps from hollows. Negating x and y of all lights gives the
 normals of the surface with its depth inverted. It has the same shading and the same attached shadows (Belhumeur,
 Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
 """
@@ -85,7 +85,7 @@ class RoughNormals:
     def rim(self) -> float:
         """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.
 
-        It is 1 for a closed convex outline, 0 where one axis is flipped, and -1 where both are.
+        It is 1 for a closed convex outline, 0 if one axis is flipped, and -1 if both are.
         """
         steep = self.outward.any(axis=2) & (self.normals[..., 2] < STEEP_Z)
         if not steep.any():
@@ -165,8 +165,8 @@ def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
 
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
-"""Lights are doubted if at least the first share of the lit observations should be in cast shadow but are not, and the
-other reading has at most the second part of that share."""
+"""Lights are doubted if more than the first share of the lit observations should be in cast shadow but are not, and the
+other reading has less than the second number times this share."""
 
 
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
@@ -178,13 +178,14 @@ _MARGIN = 0.5  # pixels that a surface must rise above a ray
 class Shadows:
     """How well cast shadows of a surface agree with dark observations that should be lit."""
 
-    agreement: float  # correlation, from -1 to 1; 0 where too few are dark
+    agreement: float  # correlation, from -1 to 1; 0 if too few are dark
     missing: float  # share of the lit observations that should be in cast shadow, but are bright
 
     def evidence(self, other: Shadows) -> float:
         """Return the evidence for another reading against this one, as an advantage of light_check.py."""
-        # Weight of a difference of agreements, relative to light_check.py. Synthetic bumps agree by 0.2 to 0.9
-        # with right lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01.
+        # Weight of a difference of agreements, relative to the weights in light_check.py. Synthetic bumps agree by 0.2
+        # to 0.9 with correct lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below
+        # 0.01.
         found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
             return found + 1

@@ -83,7 +83,7 @@ def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles)
 
 
 def _correlation(predicted: Bools, seen: Bools) -> float:
-    """Return the correlation of two sets; 0 where one has all or none."""
+    """Return the correlation of two sets; 0 if one has all or none."""
     if min(predicted.sum(), (~predicted).sum(), seen.sum(), (~seen).sum()) == 0:
         return 0.0
     return float(np.corrcoef(predicted, seen)[0, 1])
@@ -248,7 +248,7 @@ def find_lights(
     """Find the lights of the images of one object.
 
     Args:
-        observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
+        observations: (P, F), linear, 0 or more; divided by the light intensities if they are known.
         mask: (H, W) with P true pixels, in row-major order.
         intensities_known: whether the intensities are known; else they are found, too.
         first_light: where the light of the first observations comes from; see azimuth_of. It decides between a bump and

@@ -34,7 +34,7 @@ class MethodOptions:
     rotations: number of rotations of the lights whose normals a network averages.
     batch_size: pixels per batch. A processor computes a batch on each core.
     device: where to compute; "auto" is a CUDA GPU if there is one.
-    precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
+    precision: number format of a network; "auto" is bfloat16 if the device computes natively in it.
     """
 
     weights: str | None = None

@@ -39,8 +39,8 @@ The normals may have any length, 0 for a pixel that has none. All observations a
 class BatchedEstimator(Estimator):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
-    Each pixel is first divided by its largest observation. Thresholds and priors are thereby equal for dark and bright
-    pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
+    Each pixel is first divided by its largest observation. Thresholds and priors thus have the same meaning for
+    dark and bright pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
     """
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:

@@ -122,7 +122,7 @@ _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 class Perceptron(nn.Module):
     """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
 
-    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own. The hidden
+    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, if near lamps give each its own. The hidden
     layers are `width` wide. The generator draws the weights.
     """
 

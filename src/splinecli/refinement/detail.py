@@ -50,9 +50,9 @@ def restore_octave(
 ) -> Tensor:
     """Add detail to normals from half the resolution, taken from SPLINE-Net's normals where it is real.
 
-    Detail is the difference after halving normals, as HalfCapture does, and enlarging them again (Burt and Adelson, The
-    Laplacian pyramid as a compact image code, 1983). It is considered real where the detail of least squares is clearly
-    larger than its noise.
+    Detail is the part of the normals that is lost when they are halved, as by HalfCapture, and enlarged again (Burt and
+    Adelson, The Laplacian pyramid as a compact image code, 1983). It is considered real where the detail of least
+    squares is clearly larger than its noise.
 
     Args:
         enlarged: (3, H, W), unit, from half the resolution.

@@ -16,7 +16,7 @@ from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
 
-_DARK = 1e-6  # weight of a pixel that is dark under every light, beside lit ones of the capture's brightness
+_DARK = 1e-6  # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 
 
 @dataclass(frozen=True, eq=False)

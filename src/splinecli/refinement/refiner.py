@@ -1,8 +1,8 @@
 """The refinement nets on a whole capture: in tiles, and on large captures at a lower resolution.
 
 The nets were trained on objects of a hundred to three hundred pixels a side. On larger maps, their receptive field
-covers less of the object, and their results are worse. So a large capture is halved until it has the size of the
-training objects, and then enlarged octave by octave, with the detail that is real; see detail.py.
+covers less of the object, and their results are worse. So a large capture is halved until it has about the size of
+the training objects, and then enlarged octave by octave, with the detail that is real; see detail.py.
 """
 
 from __future__ import annotations

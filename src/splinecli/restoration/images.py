@@ -1,9 +1,9 @@
 """Information missing from image values: the white level, saturated observations, and the mask of the object.
 
-The white level of a capture: the stored value at which its camera saturated. Cameras of 10 to 14 bits often store their
-values in 16-bit files without scaling them, so that nothing ever reaches the file's full scale. Clipping still shows in
-the values. Many observations share the images' exact maximum, and far fewer have the values just below it. On a smooth
-surface without clipping, the maximum is no more frequent than they are.
+The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14 bits often store
+their values in 16-bit files without scaling them, so that nothing ever reaches the file's full scale. Clipping still
+shows in the values. Many observations share the images' exact maximum, and far fewer have the values just below it. On
+a smooth surface without clipping, the maximum is no more frequent than they are.
 """
 
 from __future__ import annotations
@@ -135,8 +135,8 @@ class ImageValues(NamedTuple):
     """Values that decide whether observations of one image are saturated."""
 
     full_scale: int | None  # the largest value that the file can store; None for floating-point images
-    stated: int | None  # the white level that the file states; None where it states none
-    saturated: Integers  # the pixels at the given white level or above, or at full scale where none is given
+    stated: int | None  # the white level that the file states; None if it states none
+    saturated: Integers  # the pixels at the given white level or above, or at full scale if none is given
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
     at_maximum: Integers = _NOTHING  # the pixels with this value
     # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
@@ -162,7 +162,7 @@ class Saturation:
 
     @cached_property
     def flags(self) -> Bools | None:
-        """The saturated observations (P, F), or None where none is saturated."""
+        """The saturated observations (P, F), or None if none is saturated."""
         _, saturated = self._decision
         if not any(len(pixels) for pixels in saturated):
             return None
@@ -253,7 +253,7 @@ def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: in
 
     Args:
         given: the white level that the user gave; None to find it.
-        stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
+        stated: the white level that the file states, 2^bits - 1 for a number of bits; None if it states none.
 
     Raises:
         InputError: the white level that the user gave is above the image's full scale.

@@ -4,10 +4,10 @@ Intensities: under known directions, a mostly matte surface with many orientatio
 factor: D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric stereo", TPAMI 2018. The alternation
 here (normals, then intensities) is robust: it uses least absolute deviations and medians.
 
-The colours of lamps, where they differ from image to image. A matte pixel has a colour of its own, and each lamp
-changes it by the same factors everywhere: R_pf = e_f^R a_p^R s_pf, and so on. Averaged over the channels, a red pixel
-then looks darker under a green lamp, as if it were facing away. The factors are found from the medians of the colours'
-changes, and each channel is divided by its own.
+Colours: these may vary between images. A matte pixel has a colour of its own, and each lamp changes it by the same
+factors everywhere: R_pf = e_f^R a_p^R s_pf, and so on. Averaged over the channels, a red pixel then looks darker under
+a green lamp, as if it were facing away. The factors are found from the medians of the colours' changes, and each
+channel is divided by its own.
 """
 
 from collections.abc import Callable
@@ -57,7 +57,7 @@ _CONVERGED = 1e-4  # change of the logarithms
 
 
 def estimate_light_intensities(observations: Singles, missing: Bools | None, lights: Lights) -> Doubles | None:
-    """Return light intensities (F,) with a mean of 1, or None where equal ones fit or the images do not determine them.
+    """Return light intensities (F,) with a mean of 1, or None if equal ones fit or the images do not determine them.
 
     Args:
         observations: (P, F), not divided by intensities.

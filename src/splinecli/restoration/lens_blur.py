@@ -2,8 +2,7 @@
 
 A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because it fills shadows,
 flattens highlights and mixes the outline with the background. Its width is estimated from the images alone: edges of
-shadows and highlights, and the outline of the object, are steps on any surface.
-A filter by Wiener's criterion then inverts it.
+shadows and highlights, and the outline of the object, are steps on any surface. A Wiener filter then inverts the blur.
 """
 
 from __future__ import annotations
@@ -185,7 +184,7 @@ def _product(one: Singles, other: Singles) -> float:
 
 
 def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
-    """Return the rows (H, W) of the observations of remove_blur, -1 where a pixel has none."""
+    """Return the rows (H, W) of the observations of remove_blur, -1 if a pixel has none."""
     rows = np.full(mask.shape, -1, np.int32)
     n_pixels = np.count_nonzero(mask)
     rows[mask] = np.arange(n_pixels, dtype=np.int32)
