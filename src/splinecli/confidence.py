@@ -1,7 +1,7 @@
-"""Correct what a network expects of its errors by what the images of the capture, all together, say against it.
+"""Correct the errors that a network predicts, using residuals of the whole capture.
 
-A pixel cannot tell wrong lights or values from an unusual reflectance. Many pixels can: errors of calibration follow
-the lights, the place in the image, or the brightness in the same way everywhere.
+A single pixel does not allow wrong lights or values to be distinguished from an unusual reflectance. Many pixels do:
+errors of calibration follow the lights, the place in the image, or the brightness in the same way everywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
+FEWEST_LIGHTS = 5  # with fewer, the residuals of a fit are not enough to assess a capture
 
 FEWEST_PIXELS = 50
 
 _BLOCKS = 2500  # over which normals are averaged for their curl
-_DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
+_DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels carry no information about the capture
 _FITS = 4
 _MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
@@ -37,7 +37,7 @@ def correct_errors(
 ) -> bool:
     """Correct the distributions of errors (P, 2) in place; return whether that was possible.
 
-    It is not where the capture is too small, or where the correction was not made for the estimator's weights. A pixel
+    It is impossible if the capture is too small, or if the correction was not made for the estimator's weights. A pixel
     that is dark under every light stays as it is.
 
     Args:
@@ -73,8 +73,8 @@ def correct_errors(
 def add_common_error(errors: Singles, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
-    Wrong lights or values turn the normals together. The medians of both errors are added as those of independent
-    errors are, and the shape approaches that of the common error where it is the larger one.
+    Wrong lights or values rotate the normals together. The medians of both errors are added like the medians of
+    independent errors, and the shape approaches the shape of the common error where that error is the larger one.
     """
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
@@ -84,22 +84,22 @@ def add_common_error(errors: Singles, error_deg: float) -> None:
 
 
 class CaptureFeatures(NamedTuple):
-    """Numbers that describe how well a capture fits what is assumed. NaN is unknown.
+    """Numbers that describe how well a capture fits the assumptions. NaN is unknown.
 
-    A misfit is the log of the median over pixels of what a matte surface leaves of the images, as a share of the
-    brightness; a turn the log of the median angle in degrees by which normals would turn.
+    A misfit is the log of a matte surface's residuals, as a share of the brightness and a median over pixels; a
+    turn is the log of the median angle in degrees by which normals would rotate.
     """
 
     misfit: float  # with the estimated normals
     free_misfit: float  # with those that fit best
-    rank_residual: float  # log of what three free images, the best for this capture, leave of all
+    rank_residual: float  # log of the residual of all images after the best fit of three free images to this capture
     light_misfit: float  # log of how far the lights are from those three
     free_light_misfit: float  # the same with any intensities
-    decoding: float  # log of what decoding the values once more leaves of the misfit
-    nearness: float  # of lamps as near as the images look: the width of the object over their distance
+    decoding: float  # log of the share of the residual that remains after decoding the values once more
+    nearness: float  # of lamps as near as they appear in the images: the width of the object over their distance
     near_share: float  # the share of the residual that it explains
     near_turn: float
-    bend: float  # the log of an exponent of the values; only below 1, as encoded values have, it turns normals
+    bend: float  # the log of an exponent of the values; it rotates normals only below 1, as encoded values have
     bend_share: float
     bend_turn: float
     curl: float  # log of the curl of the normals over their derivatives
@@ -114,15 +114,15 @@ class CaptureFeatures(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelScale:
-    """What relates pixels to their capture."""
+    """Constants that relate pixels to their capture."""
 
     bright: float  # brightness of a bright pixel
     middle: tuple[float, float]  # row and column of the middle of the object
     width: float  # of the object, in pixels
-    turning: Doubles  # (3, 3, 2), the turn of a normal by near lamps, over the normal and the place
+    turning: Doubles  # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
 
     def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Doubles:
-        """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""
+        """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near lamps in degrees."""
         places = self.places(rows, columns)
         turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
         turn -= np.einsum("pk,pk->p", turn, normals)[:, None] * normals
@@ -137,7 +137,7 @@ class PixelScale:
 def capture_features(
     mask: Bools, light_of: LightOf, normals: Singles, errors: Singles, lights: Doubles
 ) -> tuple[CaptureFeatures, PixelScale] | None:
-    """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
+    """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
     Args:
         mask: (H, W), with P true pixels.
@@ -171,9 +171,9 @@ def capture_features(
     difference = angle_between_deg(own, best)
 
     def explain(terms: Doubles, sign: int) -> tuple[float, float, float]:
-        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its turn.
+        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its rotation.
 
-        An amount of the other sign is no such fault, and turns nothing.
+        An amount of the other sign is not such a fault, and does not rotate any normals.
         """
         scaled_terms = fit_scaled_normals(terms, weights, lights)
         terms = terms - scaled_terms @ lights.T
@@ -213,7 +213,7 @@ def _log_median(values: Doubles, least: float = _LEAST_SHARE) -> float:
 
 
 def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles:
-    """Return values (p, F) under directions (p, F, 3) as matte pixels would show them under lights (F, 3)."""
+    """Return values (p, F) under directions (p, F, 3) converted for matte pixels to lights (F, 3)."""
     lit = (values > LIT_SHARE).astype(np.float64)
     scaled = fit_scaled_normals(values, lit, directions.astype(np.float64))
     values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
@@ -221,7 +221,7 @@ def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles
 
 
 def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Doubles) -> Doubles:
-    """Return what matte pixels with these normals (p, 3) and any albedo leave of values (p, F)."""
+    """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and any albedo."""
     cosines = (normals @ lights.T).clip(min=0)
     seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain
     weights = seen

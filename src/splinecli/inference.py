@@ -1,14 +1,14 @@
 """From a Capture and an Estimator to a NormalEstimate, and the surface from which near lamps light each pixel.
 
-The surface that decides from where, and how strongly, each near lamp lights each pixel. Fit normals, integrate them,
-move the pixels onto the surface, and fit again with the light directions and the inverse-square falloff that the lamps
-have there. The surface begins as the object's mean plane. (Logothetis et al., "A CNN based approach for the point-light
-photometric stereo problem", arXiv 2210.04655, alternate alike.)
+The surface determines the direction and the attenuation of each near lamp's light at each pixel. To find it, fit
+normals, integrate them, move the pixels onto the surface, and fit again with the light directions and the
+inverse-square falloff that the lamps have there. The surface begins as the object's mean plane. (Logothetis et al., "A
+CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
 
-Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
+If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
-The pixels are processed in tiles. The working memory of a method is that of one tile; only the results grow with the
-capture.
+The pixels are processed in tiles, so the working memory of a method depends on the tile size; only the results grow
+with the capture.
 """
 
 import time
@@ -34,14 +34,14 @@ from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
 
-METHOD = "iw12"  # the fit on the way: fast, and robust against shadows and highlights
+METHOD = "iw12"  # the intermediate fit: fast, and robust against shadows and highlights
 
 PIXELS_ON_THE_WAY = 40_000
-"""Larger captures are fitted on the way at about this size: fine detail hardly moves the surface."""
+"""Larger captures are fitted at about this size in between: fine detail hardly moves the surface."""
 
 
 def find_surface(capture: Capture) -> Capture:
-    """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is."""
+    """Return the capture with the points of its surface. With points already, or distant lights, it is unchanged."""
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
@@ -49,7 +49,7 @@ def find_surface(capture: Capture) -> Capture:
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
-    # Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are
+    # Intermediate fits. An error of the surface only matters as a share of the distance of the lamps, so few are
     # enough.
     for _ in range(2):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
@@ -72,7 +72,7 @@ _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vec
 
 @dataclass(frozen=True)
 class NormalEstimate:
-    """The normals of one capture, and their errors where there is ground truth.
+    """The normals of one capture, and their errors if the capture has ground truth.
 
     normal_map: (H, W, 3) float32, unit inside the mask and zero outside.
     seconds: time spent on the estimation.
@@ -80,7 +80,7 @@ class NormalEstimate:
     errors: summary of error_map_deg, or None.
     confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG; zero outside the
         mask. None if the method has no confidence.
-    capture_judged: whether the confidence also says how well the whole capture fits its lights and its values.
+    capture_judged: whether the confidence also covers how well the whole capture fits its lights and its values.
     """
 
     capture: Capture
@@ -114,7 +114,7 @@ def estimate_normals(
     Args:
         tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
         progress: called with the number of pixels just finished, after each batch of the estimator.
-        stage: called with the name of each later stage where it begins; its function is called with the number of
+        stage: called with the name of each later stage when it begins; its function is called with the number of
             pixels just finished.
 
     Raises:
@@ -143,7 +143,7 @@ def estimate_normals(
 def _estimate(
     capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
-    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether they judge the whole capture.
+    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
     Methods without confidence have no distributions.
     """
@@ -165,11 +165,11 @@ def _estimate(
 
 
 class PixelEstimates(NamedTuple):
-    """What an estimator found, before refinement.
+    """The results of an estimator, before refinement.
 
     normals: (P, 3) float32, unit, in the capture's frame.
     errors: (P, 2) float32, the distributions of their errors; None for methods without confidence.
-    light_of: the light of the pixels as they were seen last: without indirect light where that was removed.
+    light_of: the light of the pixels as used for the last estimate: without indirect light where that was removed.
     """
 
     normals: NDArray[np.float32]
@@ -188,12 +188,12 @@ def estimate_pixels(
 ) -> PixelEstimates:
     """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
 
-    Only the networks with a refiner remove indirect light. The refinement net also learns from what this returns.
+    Only the networks with a refiner remove indirect light. The refinement net also learns from these estimates.
 
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
-        light_without: gives the light of some pixels without indirect light, or with all that there is.
+        light_without: gives the light of some pixels without the given indirect light; None removes nothing.
         tile_pixels, progress, stage: see estimate_normals.
     """
     tile_pixels = tile_pixels or estimator.tile_pixels
@@ -218,7 +218,7 @@ def estimate_pixels(
         indirect = find_indirect_light(mask, observations, light_of, normals)
         if indirect is not None:
             light_of = partial(light_without, indirect)
-            # The other pixels keep what they have seen: to estimate all again gained 0.02 degrees.
+            # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
             estimator = estimator.rebind(light_of, n_pixels)
             for pixels in parts_of_rows(n_pixels, tile_pixels):
                 changed = pixels[indirect.counts_at(observations[pixels], pixels)]
@@ -233,7 +233,7 @@ def _no_stage(_: str) -> AbstractContextManager[Progress]:
 
 
 def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
-    """Return what gives the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
+    """Return a function for the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
     lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
     places = PixelPlaces(capture.mask)
 
@@ -259,7 +259,7 @@ def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:
-    # A zero normal would count as an error of 0 degrees, and NaN would be left out of the mean.
+    # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
         if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():

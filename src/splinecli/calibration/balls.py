@@ -1,8 +1,8 @@
 """Light directions from folders of images of mirror balls: the camera, the highlights, and the balls together.
 
-The highlight of a lamp in a mirror ball, and the light direction that follows from it. The ball's normal n at the
-highlight halves the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A
-common mistake is to use n itself as the light direction. The camera is at the origin, and the unit of length is the
+The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at the highlight halves
+the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A common mistake is to
+use n itself as the light direction. The camera is at the origin, and the unit of length is the
 radius of the ball. x is right, y up, z towards the camera.
 """
 
@@ -35,10 +35,10 @@ from splinecli.maths import Array, Doubles, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 
-DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
+DISTANT = 1e6  # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly parallel
 
 SHORTEST_LENS = 0.7
-"""Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
+"""Shortest usual focal length, in longer sides of the image. Telephones have it: 25 mm for 36 mm of film."""
 
 
 _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
@@ -62,7 +62,7 @@ class View:
         """Return a matrix (3, 3) that may be the true one."""
         factor = 1.0
         if not self.known:
-            # All rays of sight from parallel to those of the shortest lens, evenly.
+            # All rays of sight from parallel ones to the shortest lens, evenly.
             nearest = self.shortest / float(self.matrix[0, 0])
             factor = nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
@@ -81,7 +81,7 @@ def unit_rays(points: Doubles, matrix: Doubles) -> Doubles:
 def find_view(image: ImageFacts, matrix: Path | None) -> View:
     """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
 
-    Raises InputError where the file or the image cannot be read, or the file has no camera matrix.
+    Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
     """
     height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
@@ -94,7 +94,7 @@ def find_view(image: ImageFacts, matrix: Path | None) -> View:
 
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Return the focal length in pixels from EXIF tags; None where they do not tell it."""
+    """Return the focal length in pixels from EXIF tags; None if they do not contain it."""
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
             pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
@@ -156,7 +156,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
 
 
 def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
-    """Return the centre (3,) of a ball whose outline a camera sees at image points (N, 2).
+    """Return the centre (3,) of a ball whose outline is at these image points (N, 2) of a camera.
 
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
     linear. Written with m_z + 1, it is also exact for a camera that is far away.
@@ -175,7 +175,7 @@ def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
 
 
 def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doubles, Doubles]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
     with np.errstate(invalid="ignore"):
@@ -184,7 +184,7 @@ def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doub
 
 
 def check_in_front(direction: Doubles, ray: Doubles) -> None:
-    """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
+    """Raise InputError if a light direction (3,) is level with the ball or behind it, as viewed from the camera."""
     if not direction @ ray < 0:
         problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
         raise InputError(problem, hint="Place all lights on the camera's side of the object")
@@ -207,7 +207,7 @@ class BallFiles:
 
     @cached_property
     def facts(self) -> tuple[ImageFacts, ...]:
-        """What the headers of the images state."""
+        """Facts from the headers of the images."""
         return tuple(map(read_facts, self.images))
 
 
@@ -240,9 +240,9 @@ class CalibratedLights:
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
-    """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
+    """Return the files of the ball in a folder, with images in natural order or in the order of filenames.txt.
 
-    A mask that is given replaces the one in the folder. Raises InputError where there are no images.
+    A mask that is given replaces the one in the folder. Raises InputError if the folder has no images.
     """
     images, listed = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
     if not listed and 2 * sum(map(is_mask_name, images)) < len(images):  # such as chrome.mask.tga

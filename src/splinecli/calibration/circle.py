@@ -25,7 +25,7 @@ _TOLERANCE = 0.015  # of the radius: the largest distance from the circle at whi
 class Circle:
     """The outline of a ball."""
 
-    x: float  # x, y, radius: in pixels. The defaults below are those of a circle that the user gives
+    x: float  # x, y, radius: in pixels. The defaults below apply to a circle that the user gives
     y: float
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
@@ -34,7 +34,7 @@ class Circle:
 
     @property
     def outline(self) -> Doubles:
-        """The points (N, 2) of the outline near the circle. A near camera sees an ellipse, which is no circle."""
+        """The points (N, 2) of the outline near the circle. A near camera shows an ellipse instead of a circle."""
         if self.points is not None:
             return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
         return (self.x, self.y) + self.radius * _RAYS
@@ -51,7 +51,7 @@ class Circle:
         return np.asarray((x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2)
 
     def reaches_beyond(self, shape: tuple[int, ...]) -> bool:
-        """Return whether a hundredth of the radius or more lies outside the image."""
+        """Return whether a hundredth of the radius or more is outside the image."""
         reach = 0.99 * self.radius
         height, width = shape[:2]
         across = self.x - reach < -0.5 or self.x + reach > width - 0.5
@@ -61,7 +61,7 @@ class Circle:
 def circle_from_mask(mask: Bools) -> Circle:
     """Return the circle through most of the outline of the largest part of a mask (H, W).
 
-    Raises InputError if the outline is not that of a ball.
+    Raises InputError if the outline does not belong to a ball.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
@@ -84,7 +84,7 @@ def circle_from_mask(mask: Bools) -> Circle:
 def find_circle(image: Array) -> Circle:
     """Return the clearest circle in a gray image (H, W), such as a ball on another background.
 
-    Raises InputError if there is no clear circle.
+    Raises InputError if no clear circle is found.
     """
     values = image.astype(np.float32)
     # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
@@ -127,7 +127,7 @@ def _merit(circle: Circle) -> float:
 
 
 def _refine(values: Singles, guess: Circle) -> Circle | None:
-    """Return the circle through the strongest edges along rays from the guess's centre; None where too few agree."""
+    """Return the circle through the strongest edges along rays from the guess's centre; None if too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
         steps = np.arange(guess.radius - half, guess.radius + half, 0.5)
@@ -142,7 +142,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
         # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
-        clear = strength > 0.01  # weakest edge that counts
+        clear = strength > 0.01  # weakest edge that is used
         if clear.sum() < 0.2 * RAYS:
             return None
         points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
@@ -153,7 +153,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
 
 
 def _fit(points: Doubles, *, outline_points: int) -> Circle:
-    """Return the circle that most points (N, 2) lie on; a complete outline would have `outline_points`.
+    """Return the circle through most of the points (N, 2); a complete outline would have `outline_points`.
 
     RANSAC with samples of three points, then least squares over the points close to the circle.
     """
@@ -187,7 +187,7 @@ def _fit(points: Doubles, *, outline_points: int) -> Circle:
 
 
 def _through(three: Doubles) -> tuple[float, float, float] | None:
-    """Return x, y and radius of the circle through three points (3, 2), or None where they are in line."""
+    """Return x, y and radius of the circle through three points (3, 2), or None if they are collinear."""
     (ax, ay), (bx, by), (cx, cy) = three
     twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
     if abs(twice_area) < 1e-9:

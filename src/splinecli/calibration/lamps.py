@@ -1,8 +1,8 @@
 """Intensities of lamps from a gray target, positions of near ones from several balls, and the report of a calibration.
 
-Positions of near lamps from two or more mirror balls, by triangulation. Each ball gives a ray: from the highlight on
-its surface in the direction of the lamp. The balls' centres, which the size of their outlines tells, lie near a plane z
-= const, which the object's mean plane should be.
+Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from the highlight on
+its surface in the direction of the lamp. The balls' centres, which follow from the size of their outlines, are near a
+plane z = const, and the object's mean plane should be that plane.
 """
 
 import math
@@ -75,8 +75,8 @@ def measure_light_intensities(
     for position, path in enumerate(files.images):
         ratios = values[position] / np.maximum(cosines[:, position], SMALLEST_COSINE)[:, None]
         if saturated is not None:
-            # A card is alike everywhere: saturated pixels are its brightest, and shift no median. On a ball, they lie
-            # where n.l is largest, and the others tell the same without them.
+            # A card is alike everywhere: saturated pixels are its brightest, and do not shift the median. On a ball,
+            # they are where n.l is largest, and the other pixels give the same intensity without them.
             ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
         ratios = ratios[(cosines[:, position] > SMALLEST_COSINE) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= _MIN_PIXELS else np.zeros(1)
@@ -107,8 +107,8 @@ def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) ->
 PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
 HEIGHT_SPREAD = 0.5
-"""Usual difference between the heights of the balls' centres and their plane, in radii. It decides where the size of
-the outlines does not: under a distant camera."""
+"""Usual difference between the heights of the balls' centres and their plane, in radii. It matters under a distant
+camera, where the size of the outlines does not determine the heights."""
 
 CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
@@ -119,7 +119,7 @@ class LampPositions:
 
     positions: Doubles  # (F, 3)
     uncertainty: Doubles  # (F,), the distance within which the true position is with CONFIDENCE
-    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel
+    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
     view: View
 
     @property
@@ -131,7 +131,7 @@ class LampPositions:
 
 
 def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
-    """Return the positions of the lamps from balls that one camera photographed; None for balls at one place.
+    """Return the positions of the lamps from balls photographed by one camera; None for balls at one place.
 
     The uncertainty comes from repeating the computation with other pixels (PIXEL_ERROR), heights of the balls and
     cameras (View.draw). It is larger if the rays miss each other by more than this explains.
@@ -150,7 +150,7 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # Each draw adds as much to the misses as the pixels had added to those of the images, if PIXEL_ERROR is right.
+    # If PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
     uncertainty = excess * np.quantile(errors, CONFIDENCE, axis=0, method="higher")
@@ -200,7 +200,7 @@ def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float
     # Projections across each ray: their sum is singular for parallel rays.
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     weights = np.ones(starts.shape[:2])
-    # An error of direction counts in proportion to the distance, which is not known at first.
+    # An error of direction is weighted in proportion to the distance, which is not known at first.
     for _ in range(3):
         weighted = across * weights[..., None, None]
         right_side = np.einsum("bfij,bfj->fi", weighted, starts)
@@ -223,7 +223,7 @@ def calibration_report(
     """Return the report of a calibration as values for JSON, with its warnings.
 
     Args:
-        intensities: (F, 3), or None where they were not measured.
+        intensities: (F, 3), or None if they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.
     """
@@ -253,7 +253,7 @@ def calibration_report(
         else {
             "known": lamps.known,
             "positions": _rows(lamps.positions),
-            # Infinite where a lamp may be at any distance.
+            # Infinite if a lamp may be at any distance.
             "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
             "pixel_size": _round(lamps.pixel_size, 6),
         },
@@ -321,7 +321,7 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
         from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
-        # Smaller differences are no mistaken frame.
+        # Smaller differences do not indicate a wrong frame.
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of the light directions:"

@@ -35,8 +35,8 @@ def fit(
     and does not decrease as the observation grows.
 
     The length of n is free, so n = 0, g = 0 would be a solution. To exclude it, the mean of g over the used lights is
-    set to 1. This condition is linear, so the programme stays convex. It does not depend on n, so it prefers no
-    direction. The condition n_z = 1 would prefer the view direction. And it constrains g where there are data.
+    set to 1. This condition is linear, so the programme stays convex. It does not depend on n, so it does not prefer
+    any direction, whereas n_z = 1 would prefer the view direction. It also constrains g at the observed data.
 
     The prior is not from the paper. Ten lights do not determine the 13 unknowns. Among all g that fit, the prior
     selects the one nearest to Lambert's law, for which all increments are equal. With 96 lights it hardly matters. The

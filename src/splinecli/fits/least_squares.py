@@ -4,8 +4,8 @@ Robust Lambertian fit, the starting point of the networks: iteratively reweighte
 weights. Observations below 5 % of the pixel's largest are treated as shadows and get a tiny weight. Large residuals get
 smaller weights, which approximates an L1 fit.
 
-Two halves of the lights: random errors differ from light to light, so the halves disagree about them. What all lights
-show alike is either right, or wrong in the same way for all pixels of a neighbourhood.
+Two halves of the lights: random errors differ from light to light, so the halves disagree about them. Anything that all
+lights agree on is either right, or wrong in the same way for all pixels of a neighbourhood.
 
 L1 minimises the sum of absolute residuals, which shadows and highlights affect less than the sum of squares. Trimmed LS
 leaves out shadows, and the darkest and brightest observations.
@@ -27,9 +27,9 @@ from splinecli.maths.observation_map import dot
 UNSHADED = 0.6
 """The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
 observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
-a metal all others are dark beside the highlight."""
+a metal all others are dark compared with the highlight."""
 
-FEWEST_LIT = 3  # number of brightest observations that never count as shadows, because a normal needs three
+FEWEST_LIT = 3  # number of brightest observations never treated as shadows, because a normal needs three
 
 
 def lit_observations(
@@ -53,7 +53,7 @@ def lit_observations(
     return lit if valid is None else lit & valid
 
 
-RIDGE = 1e-12  # Weight of |b|^2. It matters only where the lights of positive weight lie in one plane.
+RIDGE = 1e-12  # Weight of |b|^2. It matters only if the lights of positive weight are coplanar.
 
 _TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
 
@@ -133,14 +133,14 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing."""
+    """Normals from all lights, and the disagreement between two halves of the lights. The signs are arbitrary."""
 
     normals: Tensor  # (P, 3), unit, of least squares with all lights
-    # (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a share of
-    # the albedo. On a ring of lights, it is half the difference between the normals of the halves
+    # (P, 3), the least-squares solution for the residuals, with the sign flipped in one half, as a share of the albedo.
+    # On a ring of lights, it is half the difference between the normals of the halves
     change: Tensor
-    # (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal noise.
-    # Three lights have no residuals, so they do not show it
+    # (P, 1), in radians. Its mean square equals the mean square of the normals' random errors, if all observations
+    # have equal noise. Three lights leave no residuals, so they do not show it
     noise: Tensor
 
 
@@ -163,7 +163,7 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
     albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
     normals = scaled / albedo
     signed = (observations - dot(scaled, light_directions)) * signs
-    # The signs have a part that some normal explains, to which residuals are perpendicular. Only the rest sees noise.
+    # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest measures noise.
     signs = signs.to(scaled).expand(1 if light_directions.ndim == 2 else len(scaled), -1)
     seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
     along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
@@ -175,7 +175,7 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
 def alternating_signs(light_directions: Tensor) -> Tensor:
     """Return 1 and -1 in turn (F,) for lights (F, 3) in the order of their azimuths about the middle one.
 
-    The light furthest from the middle has 1. So neither the order of the lights nor a turn of the image changes the
+    The light furthest from the middle has 1. So neither the order of the lights nor a rotation of the image changes the
     halves, unless two lights have the same direction or distance.
     """
     across = light_directions[:, :2] - light_directions[:, :2].mean(dim=0)
@@ -212,8 +212,8 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
 def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     """Return scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
 
-    Iteratively reweighted least squares comes close to the minimum. There, three residuals are zero. So the b of the
-    three smallest residuals is used where it is better.
+    Iteratively reweighted least squares comes close to the minimum, where three residuals are zero. So the b that
+    makes the three smallest residuals zero is used if it is better.
     """
     weight = torch.ones_like(observations)
     for step in range(50):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splinecli.maths import Doubles, Floats
 
 SMALLEST_PIVOT = 1e-12
-"""A usual limit of the pivots where the lights are unit vectors and the largest weight is about 1."""
+"""A usual limit of the pivots if the lights are unit vectors and the largest weight is about 1."""
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
@@ -56,7 +56,7 @@ def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> N
     return np.stack(multiply_symmetric(inverse_3x3(entries, SMALLEST_PIVOT), right_side), axis=1)
 
 
-SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one count as shadow
+SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one are treated as shadow
 _PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
 _EQUAL_WEIGHT_BELOW = 0.02  # residuals far below this share of a pixel's largest observation have nearly equal weights
 
@@ -107,7 +107,7 @@ def fit_robustly(
 
     Args:
         values: (P, F), each pixel scaled to a largest value of 1.
-        lit: (P, F), weights that do not depend on the fit, such as those of shadow_weights.
+        lit: (P, F), weights that do not depend on the fit, for example from shadow_weights.
         lights: (F, 3) or (P, F, 3), of any length.
         fits: number of weighted fits, at least 1.
         weights: of the first fit; None for `lit`.
@@ -122,7 +122,7 @@ def fit_robustly(
 def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Doubles]:
     """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
 
-    Pixels below dark_share of the brightest hundredth are dark, as the background of a capture without a mask.
+    Pixels below dark_share of the brightest hundredth are treated as dark, for example the background without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

@@ -9,7 +9,7 @@ reflectance varies slowly. For a given normal the coefficients are linear, so on
 projection).
 
 The lowest intensities alone do not determine nine coefficients well. This module therefore differs from the paper in
-two ways. Coefficients are left out where few observations are kept (coefficient_count). All but the constant one have a
+two ways. Coefficients are left out if few observations are kept (coefficient_count). All but the constant one have a
 Gaussian prior around zero, that is, around Lambert's law. The fit also estimates the noise that the prior is weighed
 against (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
 """
@@ -24,7 +24,7 @@ from torch.nn.functional import normalize
 
 from splinecli.fits.least_squares import lit_observations, weighted_least_squares
 
-FEWEST_LIT = 4  # number of brightest observations that never count as shadows: three for the normal, one for the noise
+FEWEST_LIT = 4  # number of brightest observations never treated as shadows: three for the normal, one for the noise
 RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
@@ -104,7 +104,7 @@ class _Fit(NamedTuple):
         return normalize(self.normals + (self.tangents @ move[..., None])[..., 0], dim=1)
 
     def replaced(self, trial: _Fit, better: Tensor) -> _Fit:
-        """Return this fit, with the trial in place of the pixels where it is better (P,)."""
+        """Return this fit, with the trial's values for the pixels it improves: `better` (P,)."""
         pairs = zip(trial, self, strict=True)
         return _Fit(*(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs))
 
@@ -156,7 +156,7 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     residual = problem.intensities[..., None] - design @ coefficients
     squares = residual.square().sum(dim=(1, 2))
 
-    # The number of well determined parameters (MacKay). The two angles of the normal always count.
+    # The number of well-determined parameters (MacKay). The two angles of the normal are always included.
     slack = (prior * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2)).sum(dim=1)
     freedom = (problem.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
 

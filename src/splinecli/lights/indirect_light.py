@@ -1,12 +1,13 @@
 """Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
 
 The photographs show how bright each visible part of the object is under each light, after all reflections. A matte part
-is as bright from all sides. Estimated normals give the surface. Together they tell how much light arrives at a pixel
+is as bright from all sides. Estimated normals give the surface. Together they give the light that arrives at a pixel
 from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV
 1991, also alternate between the shape and the light on it.)
 
-Two things are unknown: the exposure, that is which observation an albedo of 1 gives, and whether the object is matte
-enough. Attached shadows show both. Under a light behind its tangent plane, a pixel shows indirect light alone.
+Two things are unknown: the exposure, that is the observation for an albedo of 1, and whether the object is matte
+enough. Attached shadows show both, because a pixel reflects only indirect light if the lamp is behind its tangent
+plane.
 """
 
 from dataclasses import dataclass, replace
@@ -46,7 +47,7 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells have that of the nearest
+    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells copy the nearest block
     albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
@@ -57,7 +58,7 @@ class IndirectLight:
 
     def remove(self, observations: Singles, pixels: Rows) -> Singles:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
-        # Something is left of each observation, because what is gathered is never exact.
+        # Keep a share of each observation, because the gathered light is never exact.
         return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
     def counts_at(self, observations: Singles, pixels: Rows) -> Bools:
@@ -70,9 +71,9 @@ class IndirectLight:
 def find_indirect_light(
     mask: Bools, observations: Singles, light_of: LightOf, normals: Singles
 ) -> IndirectLight | None:
-    """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
+    """Return the indirect light of a capture, or None if the attached shadows show none that could be removed.
 
-    The camera counts as orthographic, whatever it is: only nearby parts exchange much light.
+    The camera is always treated as orthographic, because only nearby parts exchange much light.
 
     Args:
         mask: (H, W), with P true pixels.
@@ -97,7 +98,7 @@ def find_indirect_light(
     def sum_up(rows: Rows) -> Doubles:
         rows = rows[lit[rows]]
         # A block sends at most this many times the light of a matte one that faces the lamp. The rest is a
-        # highlight, which goes another way.
+        # highlight, which goes in another direction.
         most = 3.0 * albedo[rows, None]
         sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
@@ -113,17 +114,17 @@ def find_indirect_light(
     if exposure is None:
         return None
     # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak
-    # where the camera does not see what reflects.
+    # if the reflecting surface is hidden from the camera.
     exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
     # Pixels that all lamps graze may have any albedo.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
 def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Singles:
-    """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
+    """Return the light (p, F) that arrives at each block from the others, relative to the light a white one reflects.
 
-    Nothing between two blocks hides them from each other. `covered` (p,) is the share of each block that the mask
-    covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
+    Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask covers, `normals`
+    (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
     normal_map = np.zeros((*blocks.mask.shape, 3))
     normal_map[blocks.mask] = normals
@@ -131,7 +132,7 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
-    # Half a side of a block is added, because neighbours are not only their middles.
+    # Add half the side of a block, because neighbours exchange light over their whole area, not only their centres.
     square = np.square(towards).sum(axis=-1) + 0.5**2
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
@@ -144,10 +145,10 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
 
 
 def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf, normals: Singles) -> float | None:
-    """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
+    """Return the factor from albedos in the observations' unit to true ones; None without visible indirect light.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
-    under a ring of lights, indirect light does so, too. It then counts as indirect.
+    under a ring of lights, indirect light is just as uniform, and the fit assigns it to the indirect part.
     """
     found = []
     step = max(1, len(normals) // 50_000)
@@ -168,7 +169,7 @@ def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf,
     if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
-    # More alike, gathered and ambient light cannot be separated.
+    # If gathered and ambient light are more alike, they cannot be separated.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
         with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure

@@ -19,7 +19,7 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
     Args:
         rows, columns: (N,), in pixels; (0, 0) is the centre of the first pixel.
         depth: (N,), as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here in
-            multiples of that of the mean plane.
+            multiples of the mean plane's depth.
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
@@ -43,7 +43,7 @@ class LampLight:
     # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights and an
     # orthographic camera
     directions: Floats
-    turns: Singles | None = None  # (P, 3, 3), from the capture's frame to these; None where all are one
+    turns: Singles | None = None  # (P, 3, 3), rotations from the capture's frame to these; None if all are equal
 
     @classmethod
     def of(cls, observations: Singles, lamps: NearLamps) -> LampLight:
@@ -73,7 +73,7 @@ class LampLight:
 
 Rows = Integers  # numbers of some of a capture's pixels, in the order of its mask
 LightOf = Callable[[Rows], LampLight]  # from rows of a capture's pixels to their observations and light directions
-LIT_AT_ONCE = 1 << 14  # pixels whose light is asked for at once: under near lamps, each has its own lights
+LIT_AT_ONCE = 1 << 14  # pixels whose light is requested at once: under near lamps, each has its own lights
 
 
 def parts_of_rows(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[Rows]:
@@ -97,7 +97,7 @@ def _camera_position(lamps: NearLamps) -> Floats:
 
 
 def _turns_to_view(views: Floats) -> Floats:
-    """Return the shortest rotations (P, 3, 3) that turn unit vectors (P, 3) with z > 0 onto the z axis."""
+    """Return the shortest rotations (P, 3, 3) of unit vectors (P, 3) with z > 0 onto the z axis."""
     x, y, z = views.T
     a, b, c = x * x / (1 + z), x * y / (1 + z), y * y / (1 + z)
     return np.stack((1 - a, -b, -x, -b, 1 - c, -y, x, y, z), axis=1).reshape(-1, 3, 3)

@@ -2,14 +2,14 @@
 
 The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
 (Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
-factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
-Lights in a wrong order are not.
+factors are found without the lights. Correct lights are linear combinations of these factors in any frame. Lights in a
+wrong order are not.
 
 To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is
 linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a
-prior around the given ones. The prior holds what the images leave open: lights and normals may turn together. If the
-light intensities are known, nothing else is open. If not, a prior on them holds the generalised bas-relief ambiguity
-(Belhumeur, Kriegman and Yuille, IJCV 1999).
+prior around the given ones. The prior fixes the remaining freedom: lights and normals may rotate together. If the
+light intensities are known, no other freedom remains. If not, a prior on them fixes the generalised bas-relief
+ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_nor
 from splinecli.maths import Doubles, Floats, Singles
 from splinecli.maths.normals import angle_between_deg, unit
 
-LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
+LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 
 
 MIN_PIXELS_PER_LIGHT = 10
 
 MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
-INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
+INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, if none were measured
 
 
 _ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
@@ -47,12 +47,12 @@ class Factors:
     # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
     # matrices is one between images, as a share of the mean brightness
     matrix: Doubles
-    image_residuals: Doubles  # (F,), root mean squares of what the factors do not explain of each image, in this unit
+    image_residuals: Doubles  # (F,), RMS residual of each image after the fit of the factors, in this unit
     intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
     def residual(self) -> float:
-        """What the factors do not explain of all images."""
+        """The residual of all images after the fit of the factors."""
         return float(np.linalg.norm(self.image_residuals))
 
     def with_free_intensities(self) -> Factors:
@@ -73,7 +73,7 @@ class Factors:
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
 
     def intensities(self, light_directions: Doubles) -> Doubles:
-        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones where they are known."""
+        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones if they are known."""
         if self.intensities_known:
             return np.ones(light_directions.shape[:2])
         return self._fit_intensities(light_directions)[0]
@@ -86,7 +86,7 @@ class Factors:
         for _ in range(_INTENSITY_ROUNDS):
             vectors = intensities[..., None] * light_directions
             transposed = vectors.swapaxes(1, 2)
-            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may lie in one plane
+            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may be coplanar
             matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
             along = np.einsum("cf,nfc->nf", self.matrix, matrices)
             intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
@@ -95,9 +95,9 @@ class Factors:
 
 
 def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
-    """Return the factors of observations (P, F), or None where there are too few lit ones.
+    """Return the factors of observations (P, F), or None if too few of them are lit.
 
-    Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
+    Shadows are left out, and highlights get small weights: least absolute deviations, by weighted least squares.
     """
     values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
@@ -123,7 +123,7 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
 
 
 def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
-    """Return the misfits of the lights (F, 3) in random orders, in rising order."""
+    """Return the residuals of the lights (F, 3) in random orders, in rising order."""
     # A given order is compared with so many random ones.
     given = np.tile(np.arange(len(light_directions)), (250, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)
@@ -134,7 +134,7 @@ def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
 
 
 def shifted_orders(n_lights: int) -> NDArray[np.int64]:
-    """Return the orders (2 F, F) of all cyclic shifts, then those of the reversed order's; the first is the given."""
+    """Return the orders (2 F, F): all cyclic shifts, then all shifts of the reversed order; the first is as given."""
     steps = np.arange(n_lights)
     forward = (steps[None] + steps[:, None]) % n_lights
     return np.concatenate((forward, forward[:, ::-1]))
@@ -163,8 +163,8 @@ def fit_residual(values: Doubles, light_directions: Doubles) -> float:
 def sample_pixels(observations: Floats) -> Doubles:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
-    # Pixels below this share of the brightest hundredth are left out: background. The second counts where too few
-    # are left by the first, because highlights outshine the object.
+    # Pixels below this share of the brightest hundredth are left out as background. The second share is used if the
+    # first leaves too few, because highlights outshine the object.
     for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
@@ -178,7 +178,7 @@ LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
 
 LARGEST_LIGHT_ERROR_DEG = 30.0
 
-MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
 
 
 MAX_MISFIT = 0.018
@@ -186,7 +186,7 @@ MAX_MISFIT = 0.018
 have more, and a matte model would move their lights wrongly."""
 
 
-INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
+INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
 
 _MIN_PIXELS = 100
 _WORTH_PIXELS = 50.0  # see fit_near
@@ -198,7 +198,7 @@ class LightFit(NamedTuple):
     """Lights that fit the images best near given ones."""
 
     directions: Doubles  # (F, 3), unit
-    intensities: Doubles  # (F,), relative to those of the observations
+    intensities: Doubles  # (F,), relative to the intensities by which the observations were divided
     # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
     # observation
     before: float
@@ -206,12 +206,12 @@ class LightFit(NamedTuple):
 
     @property
     def fit_ratio(self) -> float:
-        """The median residual, as a share of that under the given lights."""
+        """The median residual, as a share of the median residual under the given lights."""
         return self.after / max(self.before, 1e-12)
 
 
 def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
-    """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
+    """Return the capture with refined lights, or unchanged if they do not fit much better. A warning says which.
 
     Args:
         error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
@@ -249,13 +249,13 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
 def would_refine(observations: Floats, factors: Factors | None, light_directions: Doubles) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
-    It is cheap where the given lights (F, 3) fit well. See find_factors for the factors of the observations.
+    It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the observations.
     """
-    # Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to
-    # be suggested. Few matte or shiny captures with exact lights have more.
+    # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is not tried only to
+    # be suggested. Few matte or shiny captures with exact lights exceed it.
     if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
-    # Intensities that nobody measured are not the fault of the directions.
+    # The directions are not to blame for unmeasured intensities.
     intensities = factors.intensities(light_directions[None])[0]
     return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
 
@@ -275,7 +275,7 @@ def check_distant(option: str, verb: str, *, near: bool) -> None:
 
 
 def check_light_error(error_deg: float | None, *, refines: bool) -> None:
-    """Raise UsageError for a usual error of directions that is out of range, or given where none are refined."""
+    """Raise UsageError for a usual error of directions that is out of range, or given although none are refined."""
     if error_deg is None:
         return
     if not refines:
@@ -293,7 +293,7 @@ def refine_lights(
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
 ) -> LightFit | None:
-    """Return refined lights; None where the images do not tell, or the given lights fit about as well.
+    """Return refined lights; None if the images do not determine them, or the given lights fit about as well.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
@@ -383,7 +383,7 @@ def _move_lights(
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()
-    # A light that no pixel shows keeps its given vector.
+    # A light that does not reach any pixel keeps its given vector.
     scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
     curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
     gradient = ((weights * residuals).T @ normals) * scale[:, None]

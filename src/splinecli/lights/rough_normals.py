@@ -1,13 +1,13 @@
 """Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows, by cast shadows.
 
-Evidence on the frame of light directions, from the normals that they give. Lights in a wrong frame fit the images as
-well as right ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
+The normals that lights give show whether the lights are in the right frame. Lights in a wrong frame fit the images as
+well as correct ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
 Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
 1981).
 
-Tell bumps from hollows by the shadows that a surface casts on itself. With x and y of all lights negated, the normals
-are those of the surface turned inside out. It has the same shading and the same attached shadows (Belhumeur, Kriegman
-and Yuille, IJCV 1999), but it casts shadows in other places.
+The shadows that a surface casts on itself distinguish bumps from hollows. Negating x and y of all lights gives the
+normals of the surface with its depth inverted. It has the same shading and the same attached shadows (Belhumeur,
+Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
-STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
+STEEP_Z = 0.7  # a rim pixel is considered steep if its normal is at least 45 degrees from the viewing direction
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
 _FITS = 5  # weighted fits to a pixel
 _TURNED_PIXELS = 2000
@@ -59,7 +59,7 @@ class RoughNormals:
         """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the least curl.
 
         They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A rotation by 180 degrees
-        more has the same curl. NaN where there are too few pixels.
+        more has the same curl. NaN if the mask has too few pixels.
         """
         if (found := self._derivatives_inside()) is None:
             return float("nan")
@@ -85,7 +85,7 @@ class RoughNormals:
     def rim(self) -> float:
         """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.
 
-        It is 1 for a closed convex outline, 0 where one axis is flipped, and -1 where both are.
+        It is 1 for a closed convex outline, 0 if one axis is flipped, and -1 if both are.
         """
         steep = self.outward.any(axis=2) & (self.normals[..., 2] < STEEP_Z)
         if not steep.any():
@@ -138,7 +138,7 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
 
 
 def _outward(mask: Bools) -> Doubles:
-    """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
+    """Return unit vectors (h, w, 2) out of the mask at its rim, leaving out the border of the image."""
     from scipy.ndimage import distance_transform_edt
 
     padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
@@ -165,8 +165,8 @@ def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
 
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
-"""From the first share of lit observations that should be in cast shadow and are not, lights are doubted if the other
-reading has at most the second part of it."""
+"""Lights are doubted if more than the first share of the lit observations should be in cast shadow but are not, and the
+other reading has less than the second number times this share."""
 
 
 _MAX_PIXELS, _MAX_LIGHTS = 6000, 24
@@ -178,13 +178,14 @@ _MARGIN = 0.5  # pixels that a surface must rise above a ray
 class Shadows:
     """How well cast shadows of a surface agree with dark observations that should be lit."""
 
-    agreement: float  # correlation, from -1 to 1; 0 where too few are dark
+    agreement: float  # correlation, from -1 to 1; 0 if too few are dark
     missing: float  # share of the lit observations that should be in cast shadow, but are bright
 
     def evidence(self, other: Shadows) -> float:
         """Return the evidence for another reading against this one, as an advantage of light_check.py."""
-        # Weight of a difference of agreements, beside those of light_check.py. Synthetic bumps agree by 0.2 to 0.9
-        # with right lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below 0.01.
+        # Weight of a difference of agreements, relative to the weights in light_check.py. Synthetic bumps agree by 0.2
+        # to 0.9 with correct lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below
+        # 0.01.
         found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
             return found + 1
@@ -193,7 +194,7 @@ class Shadows:
         return found
 
     def leaves_open(self, other: Shadows) -> bool:
-        """Return whether shadows that this reading needs are missing, more than those of another one."""
+        """Return whether this reading predicts shadows that are missing, more than another one does."""
         # The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images
         # were rendered without cast shadows, which is not evidence against the lights.
         return self.missing > 0.01 and other.missing < 0.75 * self.missing
@@ -251,7 +252,7 @@ def cast_shadows(heights: Doubles, lights: Doubles) -> Bools:
     cast = np.zeros((height, width, len(lights)), np.bool_)
     for place, (x, y, z) in enumerate(lights):
         level = float(np.hypot(x, y))
-        # A ray that has climbed by the whole relief meets nothing.
+        # A ray that has climbed by the whole relief cannot be blocked any more.
         longest = max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
         for step in range(2, longest if level > 0 else 0):
             down, right = round(-y / level * step), round(x / level * step)

@@ -1,19 +1,19 @@
-"""Lights from the images of the object alone (uncalibrated photometric stereo), and what its shading leaves open.
+"""Lights from the images of the object alone (uncalibrated photometric stereo), and how to resolve the ambiguities.
 
-What the shading of a matte surface leaves open about its lights, and the evidence that decides it. A bump looks like a
-hollow under lights with x and y negated: shading, attached shadows and highlights are equal, also the curl of the
-normals. Cast shadows and the outline differ. And the heights of a surface may be scaled if its lights are lowered or
-raised with them, the generalised bas-relief ambiguity, which keeps all shadows (Belhumeur, Kriegman and Yuille, "The
-bas-relief ambiguity", IJCV 1999). The albedo then changes with the slope.
+The shading of a matte surface leaves its lights ambiguous, so other evidence has to decide. A bump looks like a hollow
+under lights with x and y negated: shading, attached shadows and highlights are equal, and so is the curl of the
+normals. Cast shadows and the outline differ. In addition, the heights of a surface may be scaled if its lights are
+lowered or raised with them. This generalised bas-relief ambiguity keeps all shadows (Belhumeur, Kriegman and Yuille,
+"The bas-relief ambiguity", IJCV 1999), but the albedo then changes with the slope.
 
-The common rotation of lights and normals that the outline of the object shows. Where a smooth surface turns away from
-the camera, its normals are perpendicular to the view and to the outline. Lights that were turned together turn all
-normals with them, also those at the outline.
+The outline of the object shows a common rotation of lights and normals. Where a smooth surface curves away from the
+camera, its normals are perpendicular to the view and to the outline. A rotation of all lights rotates all normals with
+them, including the normals at the outline.
 
-The light network guesses each light from shading, shadows and outline, with an error that it expects. The images then
-decide what they can: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights are
-moved together until such a surface explains the images, within the guesses and their errors. What the shading of a
-matte surface leaves open is decided by cast shadows, the outline and the albedo.
+The light network guesses each light from shading, shadows and outline, and predicts the error of its guess. The images
+then refine these guesses: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights
+are moved together until such a surface explains the images, within the predicted errors. Cast shadows, the outline and
+the albedo resolve the remaining ambiguities.
 """
 
 import math
@@ -83,7 +83,7 @@ def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles)
 
 
 def _correlation(predicted: Bools, seen: Bools) -> float:
-    """Return the correlation of two sets; 0 where one has all or none."""
+    """Return the correlation of two sets; 0 if one has all or none."""
     if min(predicted.sum(), (~predicted).sum(), seen.sum(), (~seen).sum()) == 0:
         return 0.0
     return float(np.corrcoef(predicted, seen)[0, 1])
@@ -139,7 +139,7 @@ class OutlineTurn(NamedTuple):
     """A rotation that turns the normals at the outline outwards."""
 
     rotation: Array  # (3,), the rotation vector of lights and normals
-    # the median of what remains of the z of these normals; small where the outline is that of a smooth surface
+    # median absolute residual in z of these normals; small if a smooth surface forms the outline
     spread: float
 
     @property
@@ -157,7 +157,7 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows, or None. The border of the image is no outline.
+    """Return the rotation of the lights that the outline shows, or None. The border of the image is ignored.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
@@ -173,7 +173,7 @@ def turn_at_outline(
     turn = Rotation.identity()
     for _ in range(_ROUNDS):
         turned = turn.apply(normals)
-        # A small turn w adds w x n. The first residual is along the view axis, the second along the outline.
+        # A small rotation w adds w x n. The first residual is along the view axis, the second along the outline.
         residuals = np.stack((turned[:, 2] - _RIM_Z, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
         weights = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
@@ -223,15 +223,15 @@ def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_direc
 
 
 LARGEST_ERROR_DEG = 20.0
-"""Lights with a larger expected error on average are refused: their normals would be worth little."""
+"""Lights with a larger expected error on average are refused, because their normals would be of little use."""
 
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near
-# Log odds that the network takes a bump for a bump: fewer where it expects larger errors.
+# Log odds that the network does not confuse bumps with hollows: lower if it expects larger errors.
 _MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
-# The mean error of what is returned from that which the network expects, on 720 rendered captures with and without an
-# outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
+# Mean error of the returned lights, from the error that the network expects, fitted on 720 rendered captures with and
+# without an outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
 _ERROR_SCALE, _ERROR_POWER, _LEAST_ERROR_DEG = 0.39, 1.3, 1.2
 _MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
@@ -248,16 +248,16 @@ def find_lights(
     """Find the lights of the images of one object.
 
     Args:
-        observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
+        observations: (P, F), linear, 0 or more; divided by the light intensities if they are known.
         mask: (H, W) with P true pixels, in row-major order.
         intensities_known: whether the intensities are known; else they are found, too.
         first_light: where the light of the first observations comes from; see azimuth_of. It decides between a bump and
             a hollow. Without it, shadows and the outline decide.
-        refuse: raise an error for lights that the images do not tell; else return a guess.
+        refuse: raise an error if the images do not determine the lights; else return a guess.
 
     Raises:
-        UsageError: the first light is no known side, and no azimuth.
-        InputError: the images are all alike, they do not show one surface, or they do not tell the lights.
+        UsageError: the first light is neither a known side nor an azimuth.
+        InputError: the images are all alike, do not show one surface, or do not determine the lights.
     """
     step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
     if step > 1:
@@ -265,7 +265,7 @@ def find_lights(
         grid[::step, ::step] = mask[::step, ::step]
         observations, mask = observations[grid[mask]], mask[::step, ::step]
     _check_different(observations)
-    # Smallest share of the mask's boundary inside the image. With less, the object continues outside of it.
+    # Smallest share of the mask's boundary inside the image. With less, the object extends beyond the image.
     outlined = outline_share(mask) >= 0.5
     if refuse and first_light is None and not outlined:
         remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
@@ -283,7 +283,7 @@ def find_lights(
     error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=_WORTH_PIXELS)
     # Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes,
-    # metals among them, have at most half of it.
+    # including metals, reach at most half of this value.
     if refuse and fit is not None and fit.after > 0.08:
         problem = "the images do not show one surface under different distant lights, so the lights cannot be found"
         hint = "Check that camera and object stood still, and that all images show the same object"
@@ -298,9 +298,9 @@ def find_lights(
         directions = directions * (-1, -1, 1) if log_odds < 0 else directions
         opposite_share = 1 / (1 + math.exp(abs(log_odds)))
     turn = turn_at_outline(observations, mask, directions)
-    if turn is not None and turn.spread < 0.2:  # outlines of larger spread do not count
-        # What a larger turn has beyond twice the expected error comes from the mouth of a vessel.
-        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the turn that it shows
+    if turn is not None and turn.spread < 0.2:  # outlines of larger spread are ignored
+        # The part of a larger rotation beyond twice the expected error comes from the mouth of a vessel.
+        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the rotation that it shows
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
@@ -321,7 +321,7 @@ def find_lights(
 def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.float64]:
     """Return the directions (F, 3), or those with opposite x and y, whichever has the first light on this side.
 
-    Raises InputError where it is on neither side clearly.
+    Raises InputError if it is not clearly on either side.
     """
     azimuth = math.radians(azimuth_of(first_light))
     towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
@@ -334,11 +334,11 @@ def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.fl
 
 
 def _check_different(observations: NDArray[np.float32]) -> None:
-    """Raise InputError for images that show no change of the light."""
+    """Raise InputError if the light does not change between the images."""
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
-    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
+    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is not a change of the light
     mean = rows.mean(axis=1, keepdims=True)
-    # Images that differ by less from their mean show no light that moves.
+    # Images that differ by less from their mean do not show a moving light.
     if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
         problem = "all images are alike, so they say nothing about the lights"
         raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
@@ -349,7 +349,7 @@ def _ask_network(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
 
-    They are means over the four turns of the images by 90 degrees and their mirror images.
+    They are means over the four rotations of the images by 90 degrees and their mirror images.
     """
     area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
     small = []
@@ -375,7 +375,7 @@ def _ask_network(
 
 
 def _view(network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool) -> LightGuess:
-    """Return what the network reads off turned, then mirrored images, in the frame of the images as they are."""
+    """Return the network's guess for rotated, then mirrored images, in the frame of the images as they are."""
     images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
     if mirrored:
         images, inside = images.flip(2), inside.flip(1)

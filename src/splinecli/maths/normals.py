@@ -2,9 +2,9 @@
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
-Slopes and curvatures need no integration, so there is no drift and no tears. For a surface z(x, y) with unit normals n
+Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y) with unit normals n
 = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of (nx, ny) by x and y. Its determinant is
-the Gaussian curvature, because normals turn by as much as the surface does (Gauss), and half its trace is the mean
+the Gaussian curvature, because normals rotate by as much as the surface does (Gauss), and half its trace is the mean
 curvature (do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).
 """
 
@@ -64,7 +64,7 @@ def encode_picture(
 
 
 def describe(convention: Convention) -> str:
-    """Return the text that stands in files of normal maps: the frame, and where green points."""
+    """Return the text to write into normal map files: the frame, and the direction of green."""
     return f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
 
 
@@ -101,7 +101,7 @@ def angular_error_map_deg(
 ) -> NDArray[np.float32]:
     """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
 
-    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a normal counts: one
+    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a normal matters: one
     that points the opposite way has an error of 180 degrees, not 0.
     """
     scored = mask & ground_truth.any(axis=-1)

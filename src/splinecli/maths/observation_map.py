@@ -19,7 +19,7 @@ from torch import Tensor
 MAP_SIZE = 32
 
 Grid = Literal["even", "cnn-ps"]
-"""The rule that assigns lights to cells: ours, or that of CNN-PS and SPLINE-Net. Row 0 is y = +1 in both."""
+"""The rule that assigns lights to cells: ours, or the one in CNN-PS and SPLINE-Net. Row 0 is y = +1 in both."""
 
 
 class SparseMap(NamedTuple):

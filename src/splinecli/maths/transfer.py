@@ -1,4 +1,4 @@
-"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and those of ICC
+"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and the curves in ICC
 profiles (ISO 15076-1)."""
 
 import re
@@ -14,7 +14,7 @@ from splinecli.maths import Doubles
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
 AUTOMATIC = "auto"
-"""The curve that the images state: that of a colour profile, sRGB for JPEG and PNG that says so, linear for others."""
+"""The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states it; else linear."""
 
 TransferCurve = float | tuple[float, ...] | None
 """An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1."""
@@ -74,15 +74,15 @@ def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArra
     return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)
 
 
-LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Those of cameras and screens have a few kilobytes.
+LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Profiles of cameras and screens have a few kilobytes.
 
 _SAMPLES = 4096  # of a curve that has no name
-_SAME = 1e-3  # difference of linear values below which two curves count as one
+_SAME = 1e-3  # difference of linear values below which two curves are considered equal
 
 
 @lru_cache(maxsize=4)
 def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
-    """Return the name and the curve of a profile; None for one that is damaged or has no single curve."""
+    """Return the name and the curve of a profile; None if it is damaged or has no single curve."""
     try:
         tags = _tags(profile)
         curves = [_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
@@ -106,7 +106,7 @@ def _tags(profile: bytes) -> dict[bytes, bytes]:
 
 
 def _curve(tag: bytes) -> TransferCurve:
-    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error for no usable curve."""
+    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error if it has no usable curve."""
     stored = np.linspace(0, 1, _SAMPLES)
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)

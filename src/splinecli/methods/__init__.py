@@ -34,7 +34,7 @@ class MethodOptions:
     rotations: number of rotations of the lights whose normals a network averages.
     batch_size: pixels per batch. A processor computes a batch on each core.
     device: where to compute; "auto" is a CUDA GPU if there is one.
-    precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
+    precision: number format of a network; "auto" is bfloat16 if the device computes natively in it.
     """
 
     weights: str | None = None
@@ -48,7 +48,7 @@ class MethodOptions:
 class Method:
     """A row of METHODS.
 
-    make: returns the estimator from the method's name and its options, and imports what is heavy.
+    make: returns the estimator from the method's name and its options, and does the heavy imports.
     principle, source: for the documentation; without a source, the method is splinecli's own.
     observation_maps: whether figures of evaluations can show its observation maps.
     """

@@ -39,8 +39,8 @@ The normals may have any length, 0 for a pixel that has none. All observations a
 class BatchedEstimator(Estimator):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
-    Each pixel is first divided by its largest observation. Thresholds and priors then mean the same for dark and bright
-    pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
+    Each pixel is first divided by its largest observation. Thresholds and priors thus have the same meaning for
+    dark and bright pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
     """
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
@@ -111,7 +111,7 @@ def estimate_in_batches(
 
 Precision = Literal["float32", "bfloat16"]
 
-_CANDIDATES = 4096  # pixels from which those are chosen that the others see
+_CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 
 ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
@@ -152,17 +152,17 @@ class NetworkEstimator(Estimator):
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if rotations > 1 and self.network.config.sees_capture:
-            self.fingerprint += " of the capture, too"  # trials of before, when they saw one context, do not fit
+            self.fingerprint += " of the capture, too"  # older trials used one context for all rotations
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
-        self._contexts: list[CaptureContext | None] = [None] * rotations  # as each rotation shows the capture
+        self._contexts: list[CaptureContext | None] = [None] * rotations  # the capture's context in each rotation
 
     @torch.no_grad()
     def bind(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
         """Return this estimator with the context of one capture, from a sample of its pixels; see Estimator.
 
-        Without it, the pixels of each call of `estimate` count as a capture.
+        Without it, each call of `estimate` treats its pixels as a capture of their own.
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self

@@ -1,9 +1,9 @@
 """An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
 
-One capture has one set of lights and a few materials, so most of its pixels say the same. Under near lamps, the lights
-change smoothly over the image. The network estimates a sample of them, the perceptron learns it and estimates the rest
-at some 80 times the speed. What the perceptron does not follow is mostly the network's noise (Hinton, Vinyals and Dean,
-Distilling the knowledge in a neural network, arXiv 1503.02531).
+One capture has one set of lights and a few materials, so most of its pixels are redundant. Under near lamps, the lights
+change smoothly over the image. The network estimates a sample of the pixels, and the perceptron learns from this sample
+and estimates the rest about 80 times as fast. The part that the perceptron does not follow is mostly the network's
+noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class PixelSample:
     def unlike(self, features: Tensor) -> Tensor:
         """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
         from_rare, from_others = (_nearest(features, self.centres[group]) for group in (self.rare, ~self.rare))
-        # Rounding must not make a pixel unlike itself.
+        # Rounding must not make a pixel of the sample unlike itself.
         return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
 
 
@@ -72,7 +72,7 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
     Args:
         features: (P, C) of the pixels that may be drawn, in any order.
         generator: on the CPU.
-        rare_share: largest share of the pixels in groups that count as rare.
+        rare_share: largest share of the pixels in groups that are considered rare.
     """
     order = torch.randperm(len(features), generator=generator)
     size = min(size, len(features) // 2)
@@ -122,7 +122,7 @@ _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 class Perceptron(nn.Module):
     """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
 
-    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own. The hidden
+    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, if near lamps give each its own. The hidden
     layers are `width` wide. The generator draws the weights.
     """
 
@@ -143,13 +143,13 @@ class Perceptron(nn.Module):
         for layer in (*hidden, self.last):
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
             nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.last.weight)  # learning begins at least squares
+        nn.init.zeros_(self.last.weight)  # training starts from least squares
         self.hidden = nn.Sequential(*(part for layer in hidden for part in (layer, nn.ReLU())))
 
     def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
         """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3).
 
-        Between them stands the mean direction (P, 3) of lights (P, F, 3), because it says where a pixel is.
+        The mean direction (P, 3) of lights (P, F, 3) is placed between them, because it encodes the pixel's position.
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
@@ -214,7 +214,7 @@ _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
 
 @dataclass(frozen=True)
 class Distillation:
-    """What was learned, and how well."""
+    """The learned perceptron, and how well it learned."""
 
     sample: int  # number of pixels that the network estimated for learning
     held_out: int  # number of these that were not learned. They are an even sample of the capture
@@ -224,8 +224,8 @@ class Distillation:
 
     @property
     def is_good(self) -> bool:
-        """Whether the perceptron follows the network as closely as the network's own errors deserve."""
-        # On rendered pixels, more cost 0.3 degrees and more against the truth.
+        """Whether the perceptron follows the network closely enough, compared with the network's own errors."""
+        # On rendered pixels, a larger share increased the error against the truth by 0.3 degrees or more.
         return self.mean_deg <= 0.7 * self.expected_deg
 
 
@@ -313,7 +313,7 @@ def distil(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DistilledEstimator:
-    """Return an estimator for the pixels of one capture that learned from `teacher` on a sample of them.
+    """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of the pixels.
 
     The result is the same for the same seed.
 

@@ -37,9 +37,9 @@ class StudentSize:
 
 
 def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
-    """Return the usual size for a capture of n_pixels, and the size where that one is not enough.
+    """Return the usual size for a capture of n_pixels, and the size to use if that is not enough.
 
-    Each pixel of the sample is learned some 25 times.
+    The training visits each pixel of the sample about 25 times.
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
@@ -49,7 +49,7 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
 Directions = NDArray[np.floating]
-"""(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
+"""(F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
 the camera."""
 
 
@@ -71,7 +71,7 @@ class Estimator(ABC):
     fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
     has_confidence: whether it also estimates its own accuracy.
     tile_pixels: the number of pixels that it gets at once.
-    refiner: what corrects its map of normals by what lies around each pixel, or None.
+    refiner: corrects the map of normals, using the neighbourhood of each pixel; or None.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Estimator(ABC):
         return self.estimate(observations, light_directions, progress=progress), None
 
     def bind(self, light_of: LightOf, n_pixels: int) -> Estimator:
-        """Return the estimator for the pixels of one capture, which may have encoded a sample of them.
+        """Return the estimator for the pixels of one capture, possibly with an encoded sample as context.
 
         Args:
             light_of: gives the observations and the light directions of some pixels.
@@ -143,8 +143,8 @@ class Estimator(ABC):
 class ObservationMaps(NamedTuple):
     """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation; NaN in empty cells."""
 
-    sparse: NDArray[np.float32]  # what the network gets
-    dense: NDArray[np.float32]  # what LI-Net makes of it
+    sparse: NDArray[np.float32]  # the input of the network
+    dense: NDArray[np.float32]  # the output of LI-Net
     every: NDArray[np.float32]  # of all lights
     grid: Grid
 
@@ -152,7 +152,7 @@ class ObservationMaps(NamedTuple):
 CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
-"""The distribution of the error of a normal that nothing is known of. Its confidence is 0."""
+"""The distribution of the error of an unknown normal. Its confidence is 0."""
 
 
 def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:

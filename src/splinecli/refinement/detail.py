@@ -1,7 +1,8 @@
 """Detail that the refinement net smooths away although it is real.
 
-The net judges by the errors that SPLINE-Net expects. Many of these are the same all around, such as those of wrong
-light intensities, and say nothing about detail. Real detail agrees between two halves of the lights; noise does not.
+The net relies on the errors that SPLINE-Net predicts. Many of these are the same everywhere, for example those from
+wrong light intensities, and contain no information about detail. Real detail agrees between two halves of the lights;
+noise does not.
 """
 
 import torch
@@ -11,13 +12,13 @@ from torch.nn.functional import avg_pool2d
 from splinecli.networks.refine_net import gaussian_sum, reach_of, unit_maps
 from splinecli.refinement.halving import enlarge
 
-FINE = 1.5  # detail is what a Gaussian filter with this sigma in pixels removes
+FINE = 1.5  # detail is the part that a Gaussian filter with this sigma in pixels removes
 WINDOW = 3.0  # detail is compared in a Gaussian window with this sigma in pixels
 REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
 FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show noise well
 
 _LEAST_REAL, _SURELY_REAL = 0.7, 0.9
-"""Share of the energy of missing detail that is no noise. Below the first number nothing is restored, above the second
+"""Share of the missing detail's energy that is signal. Below the first number nothing is restored, above the second
 all."""
 
 _TINY = 1e-12
@@ -26,9 +27,9 @@ _TINY = 1e-12
 def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, mask: Tensor) -> Tensor:
     """Add detail to refined normals that the refinement net removed although it is real.
 
-    It is the detail of SPLINE-Net's normals. It counts as real where the detail that least squares has in addition is
-    clearly larger than its noise, and as far as both agree. Images that are shifted towards their lights, by half a
-    pixel for example, look the same as detail.
+    The detail comes from SPLINE-Net's normals. It is considered real where the additional detail of least squares is
+    clearly larger than its noise, and to the extent that both agree. Images that are shifted towards their lights, by
+    half a pixel for example, have the same effect as detail.
 
     Args:
         refined, estimated, least_squares: (3, H, W), unit normals. At least FEWEST_LIGHTS lights gave the last ones.
@@ -38,7 +39,7 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
     Returns:
         Unit normals (3, H, W), zero outside the mask. Black pixels stay as they are.
     """
-    mask = mask * least_squares.any(dim=0)  # black pixels show nothing
+    mask = mask * least_squares.any(dim=0)  # black pixels carry no information
     removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
     alike = _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
     return unit_maps(refined + _real_share(missing, noise) * alike * removed)
@@ -47,16 +48,16 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
 def restore_octave(
     enlarged: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, largest: Tensor, mask: Tensor
 ) -> Tensor:
-    """Add detail to normals from half the resolution: that of SPLINE-Net's normals where it is real.
+    """Add detail to normals from half the resolution, taken from SPLINE-Net's normals where it is real.
 
-    Detail is what is lost when normals are halved, as HalfCapture does, and enlarged again (Burt and Adelson, The
-    Laplacian pyramid as a compact image code, 1983). It counts as real where the detail of least squares is clearly
-    larger than its noise.
+    Detail is the part of the normals that is lost when they are halved, as by HalfCapture, and enlarged again (Burt and
+    Adelson, The Laplacian pyramid as a compact image code, 1983). It is considered real where the detail of least
+    squares is clearly larger than its noise.
 
     Args:
         enlarged: (3, H, W), unit, from half the resolution.
         estimated, least_squares, noise, mask: see restore_detail. The maps begin at even rows and columns.
-        largest: (1, H, W), the largest observation of each pixel. Bright pixels show more than dark ones.
+        largest: (1, H, W), the largest observation of each pixel. Bright pixels get more weight than dark ones.
 
     Returns:
         Unit normals (3, H, W), zero outside the mask.
@@ -69,7 +70,7 @@ def restore_octave(
 
 
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:
-    """Return which share (H, W) of missing detail (3, H, W) comes back, by the noise (1, H, W) in it."""
+    """Return the share (H, W) of missing detail (3, H, W) to restore, given the noise (1, H, W) in it."""
     real = 1 - _energy(noise, noise) / _energy(missing, missing)
     return ((real - _LEAST_REAL) / (_SURELY_REAL - _LEAST_REAL)).clamp(0, 1)
 

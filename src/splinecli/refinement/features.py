@@ -1,4 +1,4 @@
-"""What the refinement net reads of each pixel: its estimated normal and error, and how its observations fit them."""
+"""Inputs of the refinement net for each pixel: its estimated normal and error, and how its observations fit them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
 
 _LARGEST_LOG = 4.0
-_HALVES_SCALE = 3.0  # brings these small numbers near the others
+_HALVES_SCALE = 3.0  # scales these small numbers to the range of the others
 
 
 @torch.no_grad()
@@ -40,7 +40,7 @@ def refine_features(
         normals: (P, 3), unit.
         error: (P, 2), see networks/li_ne_net.py.
         reference: the brightness of the capture, see `brightness`.
-        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
+        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/least_squares.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -78,7 +78,7 @@ def refine_features(
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
-    """Return what compare_halves finds in double precision, from observations (P, F) with a largest value of 1."""
+    """Return compare_halves in double precision, from observations (P, F) with a largest value of 1."""
     found = compare_halves(observed.double(), light_directions.double(), signs)
     return TwoHalves(*(values.to(observed) for values in found))
 
@@ -89,26 +89,26 @@ def brightness(observations: Tensor) -> float:
 
 
 class Turn(NamedTuple):
-    """A mirror image (x is flipped) if `mirror`, then a turn counterclockwise by `quarters` of 360 degrees."""
+    """A mirror image (x is flipped) if `mirror`, then `quarters` counterclockwise rotations by 90 degrees."""
 
     quarters: int
     mirror: bool = False
 
     @property
     def back(self) -> Turn:
-        """The turn that undoes this one. A turned mirror image undoes itself."""
+        """The rotation that undoes this one. A rotated mirror image undoes itself."""
         return self if self.mirror else Turn(-self.quarters % 4)
 
 
 def turn_features(features: Tensor, turn: Turn) -> Tensor:
-    """Turn maps of features (..., CHANNELS, H, W)."""
+    """Rotate maps of features (..., CHANNELS, H, W)."""
     return turn_maps(features, turn, VECTORS, (TENSOR,))
 
 
 def turn_maps(
     maps: Tensor, turn: Turn, vectors: Sequence[tuple[int, int]] = (), tensors: Sequence[tuple[int, int, int]] = ()
 ) -> Tensor:
-    """Turn maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
+    """Rotate maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
     if turn.mirror:
         maps = maps.flip(-1)
         for odd in (*(x for x, _ in vectors), *(xy for _, _, xy in tensors)):

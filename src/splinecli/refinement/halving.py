@@ -1,4 +1,4 @@
-"""A capture at half the resolution, and what was found there at the full one."""
+"""A capture at half the resolution, and its results at the full one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
 
-_DARK = 1e-6  # weight of a pixel that is dark under every light, beside lit ones of the capture's brightness
+_DARK = 1e-6  # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class HalfCapture:
             observations = light_of(rows).observations
             largest = observations.max(axis=1, keepdims=True)
             equal = np.where(largest > 0, np.float32(1), np.float32(_DARK))
-            # A block's observations tell most about the normals of its brightest pixels.
+            # In a block, the observations depend mostly on the normals of its brightest pixels.
             weights = np.maximum(largest, np.float32(_DARK * reference))
             found = np.hstack((normals[rows], errors[rows])) * weights
             sent = np.hstack((observations * equal, equal, found, weights))

@@ -1,8 +1,8 @@
 """The refinement nets on a whole capture: in tiles, and on large captures at a lower resolution.
 
-The nets learned from objects of a hundred to three hundred pixels a side. On larger maps they see less of the object,
-and their results are worse. So a large capture is halved until the nets are at home, and comes back octave by octave
-with the detail that is real; see detail.py.
+The nets were trained on objects of a hundred to three hundred pixels a side. On larger maps, their receptive field
+covers less of the object, and their results are worse. So a large capture is halved until it has about the size of
+the training objects, and then enlarged octave by octave, with the detail that is real; see detail.py.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
 
 MARGIN = 112
-"""Pixels around a tile that are seen, a multiple of COARSEST.
+"""Pixels around a tile that the nets use as context, a multiple of COARSEST.
 
-Two nets can see further (RefineNet's `reach`), but what lies beyond the margin turns no normal by more than 0.01
+Two nets reach further (RefineNet's `reach`), but context beyond the margin changes no normal by more than 0.01
 degrees. A margin of 64, which is enough for one net, leaves visible seams with two.
 """
 
 TILE = 512
-"""Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin comes on top.
+"""Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin.
 
-Larger tiles take less time, because their margins are smaller in all, and more memory."""
+Larger tiles take less time, because their margins are smaller in total, but more memory."""
 
-MOST_PIXELS = 150_000  # the most pixels of a capture that the net sees as they are
+MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at full resolution
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 
@@ -62,15 +62,15 @@ class _Capture:
 
 @dataclass(eq=False)
 class NetworkRefiner:
-    """Corrects the normals of a capture, and the distributions of their errors, by what lies around each pixel.
+    """Corrects a capture's normals, and the distributions of their errors, using the neighbourhood of each pixel.
 
     Args:
         network: one refinement net or two, on their device.
         precision: the number format of the convolutions.
-        turns: the results of this many quarter turns of the map are averaged. Mirror images gain nothing beside them.
+        turns: the results of this many quarter turns of the map are averaged. Adding mirror images does not help.
         tile, margin: see TILE and MARGIN. With a margin of the net's `reach`, tiles change nothing.
-        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real; the net
-            sees their maps as they are, on more pixels once rather than in all turns.
+        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real, so the net
+            processes their maps at full resolution: more pixels, but once instead of in all turns.
     """
 
     network: RefineNet
@@ -102,12 +102,12 @@ class NetworkRefiner:
 
         Args:
             mask: (H, W), with P true pixels.
-            observations: (P, F); only their brightness counts here.
+            observations: (P, F); only their brightness is used here.
             light_of: gives the observations and the light directions of some pixels.
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
         """
-        middle = light_of(np.array([len(normals) // 2])).directions  # as one pixel sees the lights
+        middle = light_of(np.array([len(normals) // 2])).directions  # the lights at one pixel
         of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
         self._refine(_Capture(around_object(mask), observations, light_of, normals, errors, *of_whole), progress)
 
@@ -134,7 +134,7 @@ class NetworkRefiner:
         # The net's layers are large enough for all cores.
         run = map if half is None else side_by_side
         for pixels, tiles in rows_of_tiles(capture.mask, self.tile, margin):
-            return_freed_memory()  # what the tiles above left is in pieces
+            return_freed_memory()  # the freed memory of the tiles above is fragmented
             band = Band(pixels, *whole)
             for own, refined, errors in run(refine, tiles):
                 # Nothing is known of a pixel that is dark under every light.
@@ -148,7 +148,7 @@ class NetworkRefiner:
         above.write()
 
     def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile, as the net sees them."""
+        """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged over rotations."""
 
         def features_of(rows: Rows, light: LampLight, _: slice) -> torch.Tensor:
             return refine_features(
@@ -171,7 +171,7 @@ class NetworkRefiner:
         return normals, errors
 
     def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: those of the half capture, with detail."""
+        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's, with detail."""
         smooth, errors = half.enlarged(tile.box)
         inside = smooth[:, torch.from_numpy(tile.mask)].T.numpy()
         errors = errors[:, *seen].to(self._device)
@@ -224,7 +224,7 @@ class NetworkRefiner:
 
 
 def _turn_back(normals: Floats, rows: Rows, light_of: LightOf) -> None:
-    """Turn normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
+    """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
     for start in range(0, len(rows), LIT_AT_ONCE):
         part = slice(start, start + LIT_AT_ONCE)
         light = light_of(rows[part])

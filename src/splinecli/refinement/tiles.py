@@ -18,7 +18,7 @@ class Tile:
     """A part of the map with a margin."""
 
     box: Box  # where it is in the map, with the margin
-    mask: NDArray[np.bool_]  # (h, w), of the box; multiples of COARSEST, so that a turned tile has the same cells
+    mask: NDArray[np.bool_]  # (h, w), of the box; multiples of COARSEST, so that a rotated tile has the same cells
     rows: NDArray[np.integer]  # (h, w), the rows of its pixels in the capture
     inner: Part  # the part of the box without the margin
 
@@ -41,7 +41,7 @@ class Band:
             kept[rows - self._pixels.start] = found
 
     def write(self) -> None:
-        """Write what is kept into the arrays of the whole capture."""
+        """Write the kept values into the arrays of the whole capture."""
         for whole, kept in self._pairs:
             whole[self._pixels] = kept
 
@@ -51,7 +51,7 @@ def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[t
 
     Args:
         mask: (H, W), multiples of COARSEST.
-        tile, margin: the side of a tile, and of what it sees around it, multiples of COARSEST.
+        tile, margin: the side of a tile, and the width of the context around it, multiples of COARSEST.
     """
     above = pixels_before(mask)
     for top in range(0, mask.shape[0], tile):
@@ -66,7 +66,7 @@ def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[t
 def _tiles_of_band(
     mask: NDArray[np.bool_], rows: NDArray[np.integer], band: slice, inside: slice, tile: int, margin: int
 ) -> Iterator[Tile]:
-    """Yield the tiles of a band of the map whose rows `inside` are no margin."""
+    """Yield the tiles of a band of the map; `inside` are its rows without the margin."""
     for left in range(0, mask.shape[1], tile):
         outer = slice(max(0, left - margin), min(left + tile + margin, mask.shape[1]))
         inner = inside, slice(left - outer.start, left - outer.start + tile)
@@ -91,7 +91,7 @@ def around_object(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def turned_part(part: Part, shape: tuple[int, ...], quarters: int) -> Part:
-    """Return where a part of a map of this shape is when the map is turned counterclockwise by quarters."""
+    """Return where a part of a map of this shape is after a counterclockwise rotation by `quarters` quarter turns."""
     rows, columns = (slice(*side.indices(length)) for side, length in zip(part, shape, strict=True))
     height, width = shape
     for _ in range(quarters):

@@ -1,1 +1,1 @@
-"""What the values of images do not contain: white level, saturated values, mask, intensities and colours of lamps."""
+"""Information missing from image values: white level, saturated values, mask, intensities and colours of lamps."""

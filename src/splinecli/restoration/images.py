@@ -1,9 +1,9 @@
-"""What the values of images do not contain: the white level, saturated observations, and the mask of the object.
+"""Information missing from image values: the white level, saturated observations, and the mask of the object.
 
-The white level of a capture: the stored value at which its camera saturated. Cameras of 10 to 14 bits often store their
-values in 16-bit files without scaling them, so that nothing ever reaches the file's full scale. Clipping still shows in
-the values. Many observations share the images' exact maximum, and far fewer have the values just below it. On a smooth
-surface without clipping, the maximum is no more frequent than they are.
+The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14 bits often store
+their values in 16-bit files without scaling them, so that nothing ever reaches the file's full scale. Clipping still
+shows in the values. Many observations share the images' exact maximum, and far fewer have the values just below it. On
+a smooth surface without clipping, the maximum is no more frequent than they are.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from splinecli.maths import Array, Bools, Doubles, Integers, Singles
 ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 
 RAISED_WEIGHT = np.float32(0.1)
-"""Weight of an observation that the last fit raised; one that the fit meets has 50. It determines nothing but what the
-others leave open."""
+"""Weight of an observation that the last fit raised; one that the fit meets has 50. It only affects pixels that the
+others leave undetermined."""
 
 MAX_BRIGHTENING = 8.0  # no observation is restored to more than this many times the pixel's brightest stored one
 
@@ -89,7 +89,7 @@ def _restored(stored: Singles, saturated: Bools, lights: Singles) -> Singles:
 
 Origin = Literal["given", "file", "images", "full scale"]
 
-FEWEST_IMAGES = 3  # an image counts as clipped at the common maximum only if so many images reach it
+FEWEST_IMAGES = 3  # an image is considered clipped at the common maximum only if so many images reach it
 FEWEST_IMAGES_AT_BITS = 2  # or this many, if the maximum is the largest number of 8 to 15 bits
 
 FEWEST_PIXELS, SMALLEST_SHARE = 3, 1e-4
@@ -107,14 +107,14 @@ _FULL_SCALE_16_BIT = 65_535
 
 
 def check_white_level(value: float | None) -> None:
-    """Raise UsageError for a white level that is no number above 0."""
+    """Raise UsageError unless the white level is a number above 0."""
     if value is not None and not 0 < value < math.inf:
         raise UsageError(f"the white level is {value:g}, expected a number above 0")
 
 
 @dataclass(frozen=True)
 class WhiteLevel:
-    """The stored value from which observations count as saturated."""
+    """The stored value from which observations are considered saturated."""
 
     value: float  # in the unit of the files, such as 4095
     origin: Origin  # given by the user, stated in the file, seen in the images, or the full scale of the files
@@ -132,11 +132,11 @@ _NOTHING = np.empty(0, np.int64)
 
 
 class ImageValues(NamedTuple):
-    """What decides whether observations of one image are saturated."""
+    """Values that decide whether observations of one image are saturated."""
 
     full_scale: int | None  # the largest value that the file can store; None for floating-point images
-    stated: int | None  # the white level that the file states; None where it states none
-    saturated: Integers  # the pixels at the given white level or above, or at full scale where none is given
+    stated: int | None  # the white level that the file states; None if it states none
+    saturated: Integers  # the pixels at the given white level or above, or at full scale if none is given
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
     at_maximum: Integers = _NOTHING  # the pixels with this value
     # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
@@ -153,7 +153,7 @@ class Saturation:
     given: float | None = None  # the white level that the user gave; None to find it
     # the pixels whose observations are wanted; None for all. The level is decided from all pixels
     rows: Integers | None = None
-    even: bool = False  # whether the images show an even target, of which one image may be clipped, and all of it
+    even: bool = False  # whether the images show an even target; a single image of it may be clipped, even completely
 
     @property
     def white_level(self) -> WhiteLevel | None:
@@ -162,7 +162,7 @@ class Saturation:
 
     @cached_property
     def flags(self) -> Bools | None:
-        """The saturated observations (P, F), or None where none is saturated."""
+        """The saturated observations (P, F), or None if none is saturated."""
         _, saturated = self._decision
         if not any(len(pixels) for pixels in saturated):
             return None
@@ -219,7 +219,7 @@ class Saturation:
         return WhiteLevel(float(full_scale), "full scale"), saturated
 
     def _stated_level(self, maximum: int) -> int | None:
-        # PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
+        # PNG requires values that are shifted to fill 16 bits. Many programs store them unshifted.
         levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
@@ -249,11 +249,11 @@ class Saturation:
 
 
 def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
-    """Return what decides which of an image's pixels (P, C), as stored, are saturated.
+    """Return the values that decide which of an image's pixels (P, C), as stored, are saturated.
 
     Args:
         given: the white level that the user gave; None to find it.
-        stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
+        stated: the white level that the file states, 2^bits - 1 for a number of bits; None if it states none.
 
     Raises:
         InputError: the white level that the user gave is above the image's full scale.
@@ -281,7 +281,7 @@ def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[n
     """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
     lowest_compared = math.ceil(LOWEST_COMPARED * maximum)
     values = pixels.reshape(-1)
-    # Few values are near the maximum. The others are counted only where these are not enough.
+    # Few values are near the maximum. The others are counted only if these are not enough.
     for lowest in (max(lowest_compared, maximum - _NEAR), lowest_compared):
         counts = np.zeros(maximum + 1 - lowest, np.int64)
         for start in range(0, len(values), _BLOCK):
@@ -299,8 +299,8 @@ def _is_bits(level: int) -> bool:
 
 
 LEAST_BORDER, LEAST_HOLE, LEAST_BRIGHT = 0.95, 0.05, 0.5
-"""A mask is probably inverted if it has this share of the picture's border, leaves out this share of the picture, and
-what it leaves out has this share of the brightness of the rest or more. Holes of objects are dark."""
+"""A mask is probably inverted if it has this share of the picture's border, excludes this share of the picture, and the
+excluded pixels are at least this bright relative to the rest. Holes of objects are dark."""
 
 _SMALLEST, _LARGEST = 0.005, 0.98  # smallest and largest share of the picture that an object can cover
 

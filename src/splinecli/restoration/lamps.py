@@ -4,10 +4,10 @@ Intensities: under known directions, a mostly matte surface with many orientatio
 factor: D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric stereo", TPAMI 2018. The alternation
 here (normals, then intensities) is robust: it uses least absolute deviations and medians.
 
-The colours of lamps, where they differ from image to image. A matte pixel has a colour of its own, and each lamp
-changes it by the same factors everywhere: R_pf = e_f^R a_p^R s_pf, and so on. Averaged over the channels, a red pixel
-then looks darker under a green lamp, as if it were turned away. The factors are found from the medians of the colours'
-changes, and each channel is divided by its own.
+Colours: these may vary between images. A matte pixel has a colour of its own, and each lamp changes it by the same
+factors everywhere: R_pf = e_f^R a_p^R s_pf, and so on. Averaged over the channels, a red pixel then looks darker under
+a green lamp, as if it were facing away. The factors are found from the medians of the colours' changes, and each
+channel is divided by its own.
 """
 
 from collections.abc import Callable
@@ -28,11 +28,11 @@ MIN_LIGHTS = 6
 wrong."""
 
 FLAT_SPREAD = 0.35
-"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, as a coin or a
-painting. There, a tilt of all normals together looks like other intensities, so the tilt is the likeliest one."""
+"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, such as a coin or a
+painting. Tilting all its normals together has the same effect as other intensities, so the likeliest tilt is used."""
 
 TILT = 0.09  # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
-_TRUSTED_TILTS = 1.5  # times TILT: where equal intensities turn a flat object by less than that, they stay
+_TRUSTED_TILTS = 1.5  # times TILT: if equal intensities tilt a flat object by less than that, they are kept
 MAX_ERROR_RATIO = 0.35  # largest accepted residual, as a share of the residual under equal intensities
 
 MAX_ERROR = 0.035
@@ -57,11 +57,11 @@ _CONVERGED = 1e-4  # change of the logarithms
 
 
 def estimate_light_intensities(observations: Singles, missing: Bools | None, lights: Lights) -> Doubles | None:
-    """Return light intensities (F,) with a mean of 1, or None where equal ones fit or the images do not determine them.
+    """Return light intensities (F,) with a mean of 1, or None if equal ones fit or the images do not determine them.
 
     Args:
         observations: (P, F), not divided by intensities.
-        missing: (P, F), observations that do not count, such as saturated ones.
+        missing: (P, F), observations to leave out, such as saturated ones.
         lights: (F, 3), or a function from rows (p,) to (p, F, 3), as under near lamps.
     """
     chosen = _choose_pixels(observations, missing)
@@ -85,7 +85,7 @@ def estimate_light_intensities(observations: Singles, missing: Bools | None, lig
 
 
 def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArray[np.intp], Doubles, Bools] | None:
-    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them count.
+    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them to use.
 
     Returns None for too few.
     """
@@ -99,7 +99,7 @@ def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArra
 
 
 def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None:
-    """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
+    """Return the intensities (F,) at which fits and medians agree; None if a light reaches too few pixels."""
     intensities = np.ones(values.shape[1])
     for _ in range(_MAX_ROUNDS):
         scaled_normals = _fit(values, known, intensities, lights)
@@ -128,15 +128,15 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     if spread_of(normals) >= FLAT_SPREAD:
         return intensities
     directions, shown = _shown(intensities, normals, lights)
-    # How unequal the intensities are is measured where a tilt cannot explain it. Otherwise a tilt would count as
-    # inequality, and the more tilted an object is, the less its tilt would be believed.
+    # The inequality of the intensities is measured on the part that a tilt cannot explain. Otherwise a tilt would be
+    # mistaken for inequality, and a strongly tilted object would get too weak a tilt.
     tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
     tilt = _fit_tilt(shown, directions, max(_variance(shown, directions, tilt), _LEAST_VARIANCE))
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 
 def _shown(intensities: Doubles, normals: Doubles, lights: Doubles) -> tuple[Doubles, Doubles]:
-    """Return unit directions (F, 3), and what a plane with the mean normal shows under each light (F,)."""
+    """Return unit directions (F, 3), and the brightness (F,) of a plane with the mean normal under each light."""
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
     return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
@@ -153,18 +153,18 @@ def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -
 
 
 def _variance(shown: Doubles, directions: Doubles, tilt: Doubles) -> float:
-    """Return the variance of the log intensities, from what no tilt explains."""
+    """Return the variance of the log intensities that a tilt does not explain."""
     return float((_inequality(shown, directions, tilt) ** 2).sum()) / max(len(shown) - 3, 1)
 
 
 def _inequality(shown: Doubles, directions: Doubles, tilt: Doubles) -> Doubles:
-    """Return the logarithms (F,) of the intensities that a plane with this tilt needs to show what it does, mean 0."""
+    """Return the log intensities (F,), mean 0, that give a plane with this tilt the observed brightness."""
     unequal = np.log(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
     return np.asarray(unequal - unequal.mean())
 
 
 def _fit_tilt(shown: Doubles, directions: Doubles, variance: float) -> Doubles:
-    """Return the likeliest tilt (2,) of a plane if log intensities have this variance, and the tilt that of TILT."""
+    """Return the likeliest tilt (2,) of a plane, for log intensities of this variance and tilts of variance TILT^2."""
     tilt, certainty = np.zeros(2), TILT**2 / variance
     for _ in range(_TILT_FITS):
         slopes = directions[:, :2] / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)[:, None]

@@ -1,9 +1,8 @@
-"""What lens and Bayer pattern took from the images of a capture: how wide their blur is, and observations without it.
+"""Blur by the lens and the Bayer pattern: how wide it is in the images of a capture, and observations without it.
 
 A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because it fills shadows,
 flattens highlights and mixes the outline with the background. Its width is estimated from the images alone: edges of
-shadows and highlights, and the outline of the object, are steps on any surface.
-A filter by Wiener's criterion then inverts it.
+shadows and highlights, and the outline of the object, are steps on any surface. A Wiener filter then inverts the blur.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ REACH = 6
 SMALLEST_SIGMA = 0.4
 """A narrower blur is left alone: it costs little, and its estimate is wrong by 0.1 to 0.2 pixels."""
 
-WIDEST_SIGMA = 1.2  # the widest one of the captures to which the estimate was fitted
+WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
 
 NOISE = 0.005
-"""Mean power of the noise over that of the images. Chosen on rendered captures with noise, 8 bits and JPEG."""
+"""Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG."""
 
 _MOST_IMAGES = 12
-_OUTLINE = 4  # pixels around the object whose steps are looked at
-_SQUARES, _SIDE = 16, 128  # of a capture that has more pixels, only so many squares are looked at
-_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that count as edges
+_OUTLINE = 4  # pixels around the object whose steps are analysed
+_SQUARES, _SIDE = 16, 128  # a capture with more pixels is only analysed in this many squares
+_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that are treated as edges
 _FEWEST_EDGES = 60
 _CORRELATION_ERROR = 0.1
 _SMOOTHEST = 0.5
@@ -59,7 +58,7 @@ def _grown(mask: Bools, reach: int) -> Bools:
 
 
 def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | None:
-    """Sharpen observations in place; return the estimated blur, or None if there is none that matters.
+    """Sharpen observations in place; return the estimated blur, or None if it is negligible.
 
     Args:
         observations: (P + R, F), of the P pixels of a mask (H, W), then of the R pixels around it, which keep their
@@ -105,8 +104,8 @@ def polynomial(numbers: Doubles, means: Doubles, deviations: Doubles) -> Doubles
 def _widest_at(correlation: float) -> float:
     """Return the widest blur at which gradients of neighbouring pixels have no more than this correlation.
 
-    Of all surfaces, one whose pixels have nothing in common has the least correlation behind a blur. Such fine texture
-    is none of the captures to which the polynomial was fitted.
+    Among surfaces behind the same blur, the correlation is lowest if the pixels are independent of each other. The
+    captures to which the polynomial was fitted do not have such fine texture.
     """
     sigmas = np.linspace(0.05, 2, 200)
     one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)  # of the values, at one and two pixels
@@ -117,8 +116,8 @@ def _widest_at(correlation: float) -> float:
 def inverse_filter(sigma: float) -> Singles:
     """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
 
-    Of all filters of this size it has the least mean square error (Wiener's criterion) for images whose power falls
-    with the square of the frequency, as that of edges does, and white noise.
+    Of all filters of this size it has the least mean square error (Wiener's criterion) for white noise and images whose
+    power falls with the square of the frequency, as it does for edges.
     """
     frequencies = np.arange(33) / 64
     places = np.arange(REACH + 1)
@@ -135,15 +134,15 @@ def inverse_filter(sigma: float) -> Singles:
 
 
 def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles | None:
-    """Return five numbers (5,) that tell how sharp the images of a capture are, or None if they have too few edges.
+    """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too few edges.
 
     Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
     lower and the upper quartile over the steepest ones. A step between two pixels has 1; behind a blur of 0.7 pixels,
     it has 0.58. Then the correlation of the gradients of neighbouring pixels between different images, which noise does
     not change, and of gradients at a distance of two and three pixels in the same image.
 
-    See remove_blur for the arguments. The object and a narrow strip around it are looked at, in few images and, of a
-    large capture, in few squares. Values above the 0.95 quantile are cut, so that highlights do not decide alone.
+    See remove_blur for the arguments. The object and a narrow strip around it are analysed, in few images and, in large
+    captures, in few squares. Values above the 0.95 quantile are clipped, so that highlights do not dominate.
     """
     rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
     chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
@@ -185,7 +184,7 @@ def _product(one: Singles, other: Singles) -> float:
 
 
 def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
-    """Return the rows (H, W) of the observations of remove_blur, -1 where a pixel has none."""
+    """Return the rows (H, W) of the observations of remove_blur, -1 if a pixel has none."""
     rows = np.full(mask.shape, -1, np.int32)
     n_pixels = np.count_nonzero(mask)
     rows[mask] = np.arange(n_pixels, dtype=np.int32)
@@ -194,7 +193,7 @@ def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
 
 
 def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
-    """Return the parts (y, x) of a capture that show its blur: all of it, or squares of one size."""
+    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of one size."""
     box = _box(region, 0)
     if region[box].size <= _SQUARES * _SIDE**2:
         return [box]
