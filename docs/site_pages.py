@@ -53,10 +53,10 @@ def command_pages() -> dict[str, str]:
     """Return name -> Markdown of each command, from its options, as for the man pages."""
     import typer
 
-    from splinecli.cli.main import app, help_panels
+    from splinecli.cli.main import app
 
     sys.path.insert(0, str(ROOT / "man"))
-    from make_pages import EXAMPLES
+    from make_pages import EXAMPLES, help_panels
 
     group: Any = typer.main.get_command(app)
     context = group.context_class(group, info_name="splinecli", **group.context_settings)
