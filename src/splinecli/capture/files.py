@@ -1,4 +1,4 @@
-"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are."""
+"""The files of a capture: names, which identify their roles, and stamps, which reveal changes."""
 
 from __future__ import annotations
 
@@ -66,9 +66,9 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
-    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is a
-    copy that the camera or a viewer made, and does not count. What is left out has another meaning, by its stem in
-    lower case, such as "mask", or as a file that the user named.
+    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is
+    treated as a copy made by the camera or a viewer, and ignored. Also excluded are files with another role, either by
+    their lower-case stem, such as "mask", or because the user named them.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -108,7 +108,7 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise NoImagesError if there are no images."""
+    """Raise NoImagesError for an empty list of images."""
     if not images:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
         found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
@@ -191,26 +191,26 @@ class CaptureFiles:
     """The files of one capture, with the images in the order of the lights."""
 
     layout: str  # name of the arrangement of files, for people
-    name: str  # name of the capture, in most layouts that of its folder
+    name: str  # name of the capture, in most layouts the folder's name
     folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
-    # F x 3 text, or a file that names images, which sets the order of the images; None where no lights are needed
+    # F x 3 text, or a file that names images, which sets the order of the images; None if no lights are needed
     light_directions: Path | None
     light_intensities: Path | None = None  # F x 3 text, or None where no file gives them
     mask: Path | None = None  # an image, or None where every pixel counts
     ground_truth: Path | None = None  # a normal map, or None
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
-    others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
+    others: tuple[Path, ...] = ()  # pictures beside the images that are not photographs, judging by their names
     kept: tuple[int, ...] | None = None  # zero-based places in the light file of the images; None for all
-    warnings: tuple[CaptureWarning, ...] = ()  # what was chosen among files whose names are not the usual ones
+    warnings: tuple[CaptureWarning, ...] = ()  # choices made among files with unusual names
 
 
 @dataclass(frozen=True)
 class Overrides:
     """Files named by the user, which replace those in the folder.
 
-    Without needs_lights, light files in the folder do not count, and none is missed.
+    Without needs_lights, light files in the folder are ignored, and a missing one is not an error.
     """
 
     lights: Path | None = None
@@ -220,7 +220,7 @@ class Overrides:
     needs_lights: bool = field(default=True, kw_only=True)
 
     def named(self) -> tuple[Path, ...]:
-        """Return the files that are given. Raises InputError for one that is no file."""
+        """Return the files that are given. Raises InputError for a path that is not a file."""
         files = tuple(f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None)
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
@@ -240,7 +240,7 @@ _MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
 
 
 def is_mask_name(path: Path) -> bool:
-    """Return whether a picture's name has the word "mask", as NAME_mask.png and chrome.mask.tga, but is no result."""
+    """Return whether a picture's name has the word "mask", as in NAME_mask.png, and is not one of our results."""
     stem = path.stem.lower()
     is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
     return is_picture and _MASK_WORD.search(stem) is not None
@@ -254,7 +254,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
     """
     name, of_images = folder_name(folder).lower(), images[0].parent
     entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
-    with suppress(InputError):  # what is beside a folder is not always ours to read
+    with suppress(InputError):  # we may lack permission to read the parent folder
         around = list_folder(folder.absolute().parent)
         entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
     named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
@@ -285,7 +285,7 @@ LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its con
 
 
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
-    """Return JSON values that change when a file of the capture does. Take them before the files are read.
+    """Return JSON values that change when a file of the capture does. Compute them before reading the files.
 
     Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.

@@ -93,7 +93,7 @@ FORMATS = (
     LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
     LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )
-"""All formats of light files. What they are called, how they are found, read and written follows from this table."""
+"""All formats of light files. This table defines how they are named, found, read and written."""
 
 
 def format_of(path: Path) -> LightFormat:
@@ -168,9 +168,9 @@ def read_light_directions(
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
-        InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
-            vector or a light below the horizon; also where the count disagrees with the count line or with
-            n_images, and for angles that are read as vectors.
+        InputError: with the line, for a wrong number of columns, a word that is not a finite number, a zero vector or a
+            light below the horizon; also if the count disagrees with the count line or with n_images, and for angles
+            that are read as vectors.
     """
     return lights_of(read_light_table(Path(path), n_images, form), n_images, frame, form)[1]
 
@@ -271,7 +271,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> Doubles:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
-    with the line for an intensity that is no usable number.
+    with the line for an unusable intensity.
     """
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
