@@ -5,9 +5,9 @@ is fitted under each reading, and its residual is taken where the values are sto
 
     p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
 
-where the cost c is what a reading loses for its additional freedom and for being rare, and k how much the residuals of
-real materials, none of which is matte, are worth. Both were fitted to captures of all classes of materials with and
-without these faults (benchmarks/capture_faults.py --fit).
+where the cost c penalises a reading for its additional freedom and for being rare, and k is the weight of the
+residuals, since no real material is matte. Both were fitted to captures of all classes of materials with and without
+these faults (benchmarks/capture_faults.py --fit).
 """
 
 from collections.abc import Collection, Mapping
@@ -29,12 +29,12 @@ ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
 EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over what a pixel shows at right angles
+OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over the value of a pixel that faces the light
 
 COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
 
-EIGHT_BIT = 0.8  # taken off the cost of a curve where images of 8 bits do not say that they are linear
+EIGHT_BIT = 0.8  # subtracted from the cost of a curve if 8-bit images do not state that they are linear
 
 
 LIKELY = 0.5  # probability from which a reading is named
@@ -69,8 +69,8 @@ class Reading:
 
     kind: Kind
     amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
-    ratio: float  # residual over that of the given reading, on the same observations
-    evidence: float  # logarithm of its probability over that of the given reading
+    ratio: float  # residual over the given reading's, on the same observations
+    evidence: float  # logarithm of its probability over the given reading's
     normals: Doubles  # (p, 3), scaled, at the chosen pixels
     intensities: Doubles  # (F,), mean 1; ones unless they are free
 
@@ -80,7 +80,7 @@ class Doubt(NamedTuple):
 
     reading: Reading
     probability: float  # that any other reading is right
-    others: tuple[Kind, ...]  # kinds of readings that the images hardly tell apart from it
+    others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Readings:
         )
         # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
         clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
-        # Values at full scale look like a curve. As shadows, they do not count.
+        # Values at full scale look like a curve. Treated as shadows, they are ignored.
         if clipped.sum() > 1e-3 * clipped.size:
             values[clipped] = 0
         values = values.clip(min=0)
@@ -141,7 +141,7 @@ class Readings:
             found.append(unequal)
             if "curve" in kinds:  # unequal lamps may hide a curve
                 curve = self._best_curve(free=True)
-                # The intensities under the curve count, not those that a linear reading needs.
+                # The intensities under the curve matter, not the intensities that a linear reading needs.
                 of_lamps = unequal.evidence + _cost_of_equal(free.intensities) - _cost_of_equal(curve.intensities)
                 evidence = curve.evidence + of_lamps
                 found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
@@ -170,7 +170,7 @@ class Readings:
         return Doubt(best, sum(shares.values()), tuple(others))
 
     def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
-        """Return the median angle in degrees between the normals of a reading and those of the given one.
+        """Return the median angle in degrees between a reading's normals and the given reading's.
 
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
         """
@@ -217,7 +217,7 @@ class Readings:
 
 
 def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
-    """Return the best of some fits by their amounts, which has this cost beside that of its kind.
+    """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
 
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
     """
@@ -285,7 +285,7 @@ def _fit(
 
 
 def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Doubles) -> Doubles:
-    """Return the next intensities (F,) from what lights of intensity 1 would give, (p, F)."""
+    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity 1."""
     weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
     power = (weights * equal**2).sum(axis=0)
     found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)

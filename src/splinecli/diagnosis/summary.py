@@ -1,4 +1,4 @@
-"""Summary of a capture without normals, and a sample of its pixels, small enough for checks that see neighbours."""
+"""Summary of a capture without normals, and a sample of its pixels, small enough for checks that use neighbours."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,7 +40,7 @@ def grid_of(mask: Bools) -> Part:
 def closeup_of(mask: Bools) -> Part:
     """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W) with pixels."""
     middles = []
-    for axis in (1, 0):  # the median row and column of its pixels, without a list of these, which takes 16 bytes each
+    for axis in (1, 0):  # the median row and column of its pixels, without listing them, which takes 16 bytes each
         up_to = np.cumsum(np.count_nonzero(mask, axis=axis))
         middles.append(int(np.searchsorted(up_to, (up_to[-1] + 1) // 2)))
     row, column = (max(0, middle - CLOSEUP_SIDE // 2) for middle in middles)
@@ -60,7 +60,7 @@ def sample_observations(
 ) -> Sample:
     """Return the sample of a mask (H, W) in a part of the images; None for its grid.
 
-    Observations (P, F) are those of the mask, or of those of its pixels that are `known`: at least those of the part.
+    Observations (P, F) cover the mask, or only its `known` pixels, which include at least the pixels of the part.
     """
     part = part or grid_of(mask)
     chosen = pixels_of([part], mask)
@@ -93,7 +93,7 @@ _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture; only the mask's pixels count."""
+    """One image of a capture; only the mask's pixels are used."""
 
     path: Path
     shape: tuple[int, ...]  # (H, W, C) as stored

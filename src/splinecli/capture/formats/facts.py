@@ -1,6 +1,6 @@
-"""The facts of an image file, found in its header by one look: size, transfer curve, white level and EXIF tags.
+"""The facts of an image file, read from its header in one pass: size, transfer curve, white level and EXIF tags.
 
-The parts before the pixels are walked here, with bounds, because Pillow reads hostile ones without end. Pillow reads
+The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones without end. Pillow reads
 the EXIF tags, and tifffile the tags of TIFF.
 """
 
@@ -60,10 +60,10 @@ _RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 
 @dataclass(frozen=True)
 class StatedCurve:
-    """What a file says of its transfer curve."""
+    """The transfer curve that a file states."""
 
     curve: TransferCurve = 1.0  # see TransferCurve; linear where the file says nothing
-    by: str = ""  # what says so, for people; empty for nothing
+    by: str = ""  # the source of the curve, for messages; empty for none
     unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
@@ -74,18 +74,18 @@ _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: 
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the header of an image file states."""
+    """The facts in the header of an image file."""
 
     path: Path
     kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
-    curve: StatedCurve = StatedCurve()  # that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    curve: StatedCurve = StatedCurve()  # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
     # the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is in the unit of
     # the decoded values: full scale for a RAW file, whatever its tags say
     white_level: int | None = None
     # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
+    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is requested
 
     @property
     def stated_channels(self) -> int | None:
@@ -229,7 +229,7 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
             number = file.read(2)[:1]
             parts[number] = file.read(length - 14)
     profile = None
-    if parts:  # b"" counts as one that cannot be read
+    if parts:  # b"" is treated as an unreadable one
         short = sum(map(len, parts.values())) <= LARGEST_PROFILE
         profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
     curve = _curve(StatedCurve(SRGB, "JPEG"), profile)
@@ -294,7 +294,7 @@ def _level(bits: int) -> int | None:
 
 
 def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
-    """Return the curve of a profile; what else the file states where it has none, or none that can be read."""
+    """Return the curve of a profile, or the otherwise stated curve if the profile is missing or unreadable."""
     if profile is None:
         return stated
     found = profile_curve(profile)
@@ -325,7 +325,7 @@ def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
 
 
 UPRIGHT = 1  # orientation of images that are shown as they are stored
-_SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
+_SAME = 0.1  # share within which two exposures are considered equal: shutters and ISO numbers are rounded
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 
 
@@ -397,8 +397,8 @@ def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | 
 def common_orientation(images: Sequence[ImageFacts]) -> int:
     """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT where they state none.
 
-    RAW files are not asked: their pixels are read as the sensor has them. Raises InputError for two images with
-    different ones, whose pixels do not fit on each other.
+    The orientation of RAW files is ignored: their pixels are read in the sensor's orientation. Raises InputError for
+    two images with different orientations, because their pixels do not correspond.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)

@@ -1,7 +1,8 @@
 """Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear values, and as masks.
 
-The one check, and the one message, for the sizes of images and the memory of captures: before they are decoded, from
-what their header says. A few kilobytes may claim gigabytes of pixels, by mistake or by intent.
+The sizes of images and the memory of captures are checked only here, with the same messages everywhere. The check uses
+the header, before anything is decoded: a file of a few kilobytes may state gigabytes of pixels, by mistake or by
+intent.
 
 Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the
 container is checked before it is decoded, and the messages of the C libraries are caught and searched.
@@ -49,7 +50,7 @@ class ExpectedSize:
 
     shape: tuple[int, ...]  # (H, W) or (H, W, C)
     like: str  # whose size it is, for messages, such as the name of the first image
-    what: str = "an image"  # what the image is, with its article
+    what: str = "an image"  # description of the image, with its article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
         """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
@@ -127,7 +128,7 @@ _LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previe
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
-    The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
+    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
     and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
     EXIF orientation is ignored, because all images of a capture share one pixel grid. The header is compared with the
     expected size.
@@ -313,7 +314,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
 def cut_out(alpha: Array | None) -> Bools | None:
     """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
 
-    Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
+    A pixel is opaque above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
     """
     opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)
     return opaque if opaque is not None and opaque.any() and not opaque.all() else None
