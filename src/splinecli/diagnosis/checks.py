@@ -109,7 +109,7 @@ def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
 
 def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread < 0.1:  # a low light_spread: the lights barely determine the normals
+    if spread < 0.1:  # see light_spread; such lights determine the normals poorly
         where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
         times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
         text = f"The lights {where}, so noise and small errors of their directions grow about {times}"

@@ -89,7 +89,7 @@ def own_groups(controller: str) -> Iterator[Path]:
         if not top.is_dir():
             top = _MOUNT / controller
         folder = top / group.lstrip("/")
-        # Inside a container the path may be that of the host, which does not exist here. The top always does.
+        # Inside a container the path may be the host's, which does not exist here. The top always exists.
         for place in (folder, *folder.parents):
             yield place
             if place == top:
@@ -127,7 +127,7 @@ def return_freed_memory() -> None:
 
 
 def _of_c_library(name: str) -> Callable[..., object]:
-    """Return a function of the C library, or one that does nothing where there is none of this name."""
+    """Return a function of the C library, or one that does nothing if the library lacks this name."""
     try:
         import ctypes
 
@@ -142,7 +142,7 @@ def _free_memory() -> float:
 
 
 def _left_in_group(folder: Path) -> float:
-    """Return what the limit of a control group leaves. The group's file cache can be freed.
+    """Return the bytes left under the limit of a control group. The group's file cache can be freed.
 
     Without a limit it is infinity or, in version 1, a huge number.
     """
@@ -177,7 +177,7 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that there is no memory left, in Python, PyTorch or the loading of a library."""
+    """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a library."""
     text = str(error).lower()
     return isinstance(error, MemoryError) or (
         isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
@@ -217,9 +217,9 @@ def choose_precision(name: Precision, device: torch.device) -> Literal["float32"
 def use_available_cores() -> None:
     """Limit PyTorch's threads to the cores that this process may use.
 
-    Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
-    may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
-    ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
+    Call it once before a long computation. PyTorch starts one thread per core of the machine, even if a container may
+    use fewer cores. The threads then share the cores, and each step waits for the slowest. The number is only ever
+    lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
     """
     import torch
 
@@ -244,7 +244,7 @@ def cgroup_quotas() -> list[float]:
     quotas = []
     for folder in own_groups("cpu"):
         # Quota and period in microseconds: in one file of version 2, or in two of version 1. The first is "max" or -1
-        # where there is none.
+        # without a quota.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
                 quota, period = " ".join((folder / name).read_text("utf-8") for name in names).split()
@@ -288,7 +288,7 @@ def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> I
     """Yield function(part) of each part, in order, computed without gradients on as many threads as PyTorch uses.
 
     Within the function, each operation of PyTorch uses one thread. At most one result more than there are threads is
-    kept. An error is raised when the turn of its part comes.
+    kept. An error is raised when its part is due.
     """
     import torch
 
