@@ -28,7 +28,7 @@ from splinecli.system.files import check_file, file_sha256, find_mode, is_found_
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # images only where a folder has no others
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # treated as images only in a folder without others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
 IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
@@ -50,7 +50,7 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 def list_folder(folder: Path) -> list[Path]:
     """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
 
-    Raises InputError where the folder is missing, is a file, or cannot be read.
+    Raises InputError if the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
@@ -190,14 +190,14 @@ results may be the same."""
 class CaptureFiles:
     """The files of one capture, with the images in the order of the lights."""
 
-    layout: str  # name of the arrangement of files, for people
+    layout: str  # readable name of the arrangement of files
     name: str  # name of the capture, in most layouts the folder's name
     folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
     # F x 3 text, or a file that names images, which sets the order of the images; None if no lights are needed
     light_directions: Path | None
-    light_intensities: Path | None = None  # F x 3 text, or None where no file gives them
-    mask: Path | None = None  # an image, or None where every pixel counts
+    light_intensities: Path | None = None  # F x 3 text, or None if no file gives them
+    mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
@@ -247,7 +247,7 @@ def is_mask_name(path: Path) -> bool:
 
 
 def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return the mask of photographs that have none with a usual name, and a warning that says which; None for none.
+    """Return a mask for photographs without one of a usual name, and a warning that names it; None if none is found.
 
     It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
     name; or else the alpha channel of the first photograph. Of several pictures, none is chosen.

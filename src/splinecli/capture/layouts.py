@@ -52,7 +52,7 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
-    Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
+    Raises InputError if a file is missing, there are several such folders, or the images do not match the lights.
     """
     captures = list_cyclesps(folder)
     if captures is None:
@@ -148,7 +148,7 @@ _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all
 """Words in the names of pictures that other programs leave beside the photographs."""
 
 _RESULT_WORDS = frozenset({"demo", "result", "results"})
-"""The same, where no light file says how many photographs there are."""
+"""The same, if no light file gives the number of photographs."""
 
 _MOST_OTHERS = 0.25  # share of the images; if more names have these words, they are photographs
 
@@ -163,7 +163,7 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
-    Raises InputError where the folder is missing, is a file or contains no images; filenames.txt names an image that
+    Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
     does not exist; the light file is missing; or a file of the overrides does not exist.
     """
     folder = Path(folder)
@@ -201,7 +201,7 @@ def _images_folder(folder: Path) -> Path | None:
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """Return the captures of a dataset's folder in natural order; the folder alone where it is a capture itself.
+    """Return the captures of a dataset's folder in natural order; only the folder itself if it is a capture.
 
     A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
     or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The

@@ -69,12 +69,12 @@ def _encode_npy(directions: Doubles, images: Sequence[Path]) -> bytes:
 class LightFormat:
     """A format of light files. To add one, write its reader and a row of FORMATS."""
 
-    name: str  # for people
+    name: str  # for messages
     suffixes: tuple[str, ...]  # in lower case; none for the format of all files with a suffix that no other row has
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
     found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
-    rank: int = 0  # files of a lower rank are found first. In rank 0, names count in order; in others, two are an error
-    recognise: Callable[[Path], bool] = Path.exists  # says by content which of the formats of one suffix a file has
+    rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
+    recognise: Callable[[Path], bool] = Path.exists  # decides by content between formats with one suffix
     encode: Callable[[Doubles, Sequence[Path]], bytes] | None = None  # directions (F, 3) of images; None if only read
 
 
@@ -353,15 +353,15 @@ class NamedLights:
 
     path: Path
     names: tuple[str, ...]  # names of the images, without folders
-    lines: tuple[int | None, ...]  # the line of each light in the file; None for each where the file has no lines
+    lines: tuple[int | None, ...]  # the line of each light in the file; None for each if the file has no lines
     directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
-    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None where the file has none
+    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None if the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
 
-        Images that no light names are left out, unless they are matched by order. Raises InputError where two lights
-        have one name, or neither the names nor the number of images fit.
+        Images that no light names are left out, unless they are matched by order. Raises InputError if two lights have
+        the same name, or neither the names nor the number of images fit.
         """
         lines: dict[str, int | None] = {}
         for name, line in zip(self.names, self.lines, strict=True):

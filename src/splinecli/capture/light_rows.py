@@ -119,8 +119,8 @@ AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format a
 def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:
     """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
 
-    Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
-    slant from the camera axis.
+    Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane towards the camera,
+    and the slant from the camera axis.
     """
     azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
     level = np.cos(elevation)

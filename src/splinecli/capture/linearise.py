@@ -74,7 +74,7 @@ class Window:
         return whole
 
     def on(self, image: ImageFacts) -> Window:
-        """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
+        """Return the window on images of the size of this one. Raises InputError if the box is not inside."""
         if self.is_whole:
             return self
         height, width = shape = image.size[0][:2]
@@ -152,7 +152,7 @@ class RadiometricCalibration:
         return self, warnings
 
 
-AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images say otherwise
+AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images state a curve
 AS_STORED = RadiometricCalibration()  # stored values are linear light
 
 EVERY_PIXEL = slice(None)
@@ -247,7 +247,7 @@ class StoredPixels:
     values: Array  # (P, C), as stored
     linear: Singles  # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
     intensity: Doubles  # (3,), RGB, of the light
-    stated_white_level: int | None = None  # the white level that the file states; None where it states none
+    stated_white_level: int | None = None  # the white level that the file states, or None
 
     def observe(self) -> Singles:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.

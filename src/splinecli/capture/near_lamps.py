@@ -197,7 +197,7 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
 def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools) -> list[CaptureWarning]:
     """Warn that lights are treated as distant over a mask (H, W), although a file has their positions.
 
-    The lamps of the file are None where their scale is unknown.
+    The lamps of the file are None if their scale is unknown.
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
@@ -305,8 +305,8 @@ NO_LAMP_OPTIONS = LampOptions()
 class LampFiles:
     """Near lamps as given by files and options, before the lights and the images are read."""
 
-    positions: Path | None  # the file of positions, or None where `distance` puts the lamps in the light directions
-    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
+    positions: Path | None  # the file of positions, or None if `distance` puts the lamps in the light directions
+    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None if it is unknown
     pixel_size: float | None
     object_width: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
@@ -314,7 +314,7 @@ class LampFiles:
     used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
 
     def in_words(self) -> str:
-        """Return the source of the lamps' positions, for people."""
+        """Return a description of the source of the lamps' positions."""
         if not self.used:
             return f"{self.positions} is not used"
         what, width = ("a pixel", self.pixel_size) if self.object_width is None else ("the object", self.object_width)
@@ -377,7 +377,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
 def find_camera(folder: Path, lamps: LampFiles | None, options: LampOptions) -> tuple[Doubles | None, tuple[Any, ...]]:
     """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
 
-    Raises InputError where the file is wrong.
+    Raises InputError if the file is wrong.
     """
     folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
     path = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)

@@ -73,7 +73,7 @@ def open_capture(
         white_level: stored value from which an observation is considered saturated, such as 4095 for 12 bits. By
             default it is found from the files and their values (see WhiteLevel).
         lights_format: whether the rows of a light file of text are vectors or angles.
-        lamps: where near lamps are, and the camera, if no files in the folder say so.
+        lamps: positions of near lamps, and the camera, unless files in the folder give them.
         find_lights: estimates the lights from the images, instead of reading light files.
 
     Raises:

@@ -38,7 +38,7 @@ class FoundLights:
 
     directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
     errors_deg: Doubles  # (F,), the expected errors of the directions in degrees
-    intensities: Doubles | None = None  # (F,), with a mean of 1; None where they are known
+    intensities: Doubles | None = None  # (F,), with a mean of 1; None if they are known
 
 
 def azimuth_of(first_light: str) -> float:
@@ -111,11 +111,11 @@ class Capture:
             was restored.
         white_level: the stored value from which observations were considered saturated; None for floating-point images
             and for captures that are not read from images.
-        light_errors_deg: (F,) float64, the expected errors of light_directions where they were found from the images;
+        light_errors_deg: (F,) float64, the expected errors of light_directions if they were estimated from the images;
             else None.
         removed_blur: the standard deviation in pixels of the blur that was removed from the images; None for none.
-        lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
-            image on the object's mean plane. None for distant lights.
+        lamps: the positions of near lamps; light_directions then hold at the origin, the middle of the image on the
+            object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic camera. Near lamps
             have their own.
 

@@ -59,7 +59,7 @@ class CaptureSource:
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
     light_directions: Doubles  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: Doubles  # (F, 3), RGB; ones where no file gives them
+    light_intensities: Doubles  # (F, 3), RGB; ones if no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
     white_level: float | None = None  # stored value from which an observation is saturated; None to find it
@@ -122,7 +122,7 @@ class CaptureSource:
         """Return the values under the chosen lights and the data needed to restore the saturated ones; see read.
 
         Unless `as_stored` is set, the blur of the lens is removed (see remove_blur), and colours of lamps that
-        differ are divided out, unless the user says that lamps are equal.
+        differ are divided out, unless the user states that lamps are equal.
         """
         everything = tuple(range(self.n_lights))
         indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
@@ -178,7 +178,7 @@ class CaptureSource:
     def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
-        Raises InputError where no object stands out, or an image cannot be read.
+        Raises InputError if no object stands out, or an image cannot be read.
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
@@ -224,7 +224,7 @@ class CaptureSource:
         return [mask_inverted(path.name)] if looks_inverted(mask, brightness) else []
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
-        """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
+        """Return the mask (H, W). Raises InputError if the sizes of images differ or the memory is too small."""
         size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
         if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
@@ -237,7 +237,7 @@ class CaptureSource:
     def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
-        Raises InputError where a lamp would be inside the object.
+        Raises InputError if a lamp would be inside the object.
         """
         if self.lamps is None:
             return None, []
@@ -258,7 +258,7 @@ class CaptureSource:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
         Of these pixels (P,), the stored values are complete; for the linear ones, see pixel_reader. Raises InputError
-        where an image cannot be read, or does not have the size of the mask.
+        if an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
         pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
@@ -299,7 +299,7 @@ def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
 
 
 def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
-    """Raise InputError where a capture takes more memory than there is; see capture_bytes."""
+    """Raise InputError if a capture needs more memory than is available; see capture_bytes."""
     height, width = largest[0][:2]
     check_memory(
         capture_bytes(largest, n_pixels, n_lights),

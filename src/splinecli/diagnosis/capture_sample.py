@@ -35,7 +35,7 @@ class CaptureSample:
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
-    intensities_known: bool  # whether they are given, or the user says that they are equal
+    intensities_known: bool  # whether they are given, or the user states that they are equal
     intensities: Doubles | None = None  # (F,), the given ones, by which the observations were divided
     estimated: Doubles | None = None  # (F,), the estimated ones, by which the sample was not divided
     eight_bit: bool = False  # whether the images have 8 bits
@@ -130,7 +130,7 @@ class CaptureSample:
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that fits the images best, and its probability; None if nothing can be said."""
+        """The other reading that fits the images best, and its probability; None if the readings cannot be compared."""
         kinds: set[Kind] = {"offset", "intensities"}
         if self.linear:
             kinds.add("curve")

@@ -136,7 +136,7 @@ def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
 
 
 def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
-    """Suggest to refine the lights where this makes them fit much better."""
+    """Suggest refining the lights if this makes them fit much better."""
     if seen.has_positions or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None:
         return []
     moved_deg = angle_between_deg(refined.directions, seen.directions)
@@ -160,7 +160,7 @@ def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[Capt
     if reading.kind == "intensities" and seen.intensities is None:
         observations = np.asarray(seen.observations, np.float32)
         if estimate_light_intensities(observations, None, seen.directions) is not None:
-            return []  # `infer` estimates them, and says so
+            return []  # `infer` estimates them, and reports it
     error_deg = seen.readings.error_deg(reading, seen.estimated)
     left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
     if seen.doubt.others:
@@ -219,7 +219,7 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     )
 
 
-REPEATED = frozenset({codes.REPEATED_IMAGES})  # where the lights differ, these contradict any others
+REPEATED = frozenset({codes.REPEATED_IMAGES})  # if the lights differ, these contradict all others
 
 DOUBTED = REPEATED | {
     codes.IMAGES_SHIFTED, codes.IMAGE_INCONSISTENT, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_ILL_CONDITIONED
@@ -236,7 +236,7 @@ class Check:
 
     find: returns warnings of the faults that it finds.
     unless: earlier warnings after which it is skipped.
-    needs_lights: whether it is skipped where the lights were found from the images.
+    needs_lights: whether it is skipped if the lights were estimated from the images.
     """
 
     find: Callable[[CaptureSample], Iterable[CaptureWarning]]

@@ -67,7 +67,7 @@ class LightCheck:
     best: Candidate | None
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
-    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no reading
+    # (F, 3), the lights of the observations in the best reading; None if the given one is the best, or no reading
     # clearly is
     mended: Doubles | None
     # the median angle by which the given lights change the normals, if the best reading is right; None if the given is

@@ -377,7 +377,7 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -
     orders = np.stack((lights, *(rng.permutation(lights) for _ in range(_FITTED_ORDERS))))
     intensities = factors.intensities(orders)
     given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
-    # Lights whose residual is below this share of that in random orders are not said to be in a wrong order.
+    # Lights whose residual is below this share of the residual in random orders are not reported as wrong.
     return given > 0.7 * float(np.median(random))
 
 

@@ -32,7 +32,7 @@ from splinecli.maths.normals import angle_between_deg
 class OddImageLimits:
     """Thresholds of the check for a single image that contradicts the others."""
 
-    min_lights: int = 10  # with fewer, a right image may seem odd by chance
+    min_lights: int = 10  # with fewer, a correct image may seem odd by chance
     min_misfit: float = 0.04  # of lights, one of whose images is odd, as a share of the brightness
     residual: float = 0.2  # of the factors; with more, as on metals, residuals of lights are not conclusive
     of_others: float = 0.15  # the same of the other images, for residuals
@@ -207,7 +207,7 @@ def _halves(inner: Singles) -> Iterator[Singles]:
 
 
 def _top(before: float, middle: float, after: float) -> float:
-    """Return where the parabola through three values has its top, from the middle one, which is the largest."""
+    """Return the position of the peak of the parabola through three values, relative to the middle, largest one."""
     return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
 
 

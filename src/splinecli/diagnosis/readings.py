@@ -1,7 +1,7 @@
 """Other readings of the images: encoded values, near lamps, unequal intensities, and light that every image has.
 
 Any one of them can be mistaken for another, so all are fitted to the same pixels and compared together. A matte model
-is fitted under each reading, and its residual is taken where the values are stored. The probability of a reading is
+is fitted under each reading, and its residual is computed in stored values. The probability of a reading is
 
     p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
 
@@ -97,7 +97,7 @@ class Readings:
         sample: its observations are as stored, not divided by intensities.
         lights: (F, 3), unit.
         intensities: (F,), those that were measured; None for equal ones.
-        eight_bit: whether the images have 8 bits and do not say that they are linear.
+        eight_bit: whether the images have 8 bits and do not state that they are linear.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Readings:
         return found
 
     def likeliest(self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()) -> Doubt | None:
-        """Return the reading of these kinds that fits best, and how likely it is; None if nothing can be said.
+        """Return the reading of these kinds that fits best, and how likely it is; None if they cannot be compared.
 
         Kinds that are `accepted` are part of the given reading.
         """
@@ -230,8 +230,8 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
     if kind != "intensities" or given.residual < 0.06:
         spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
-        # Spread of the normals (their second largest standard deviation) from which powers count in full, and the
-        # share of them that counts for a plate.
+        # Spread of the normals (their second largest standard deviation) from which powers have full weight, and the
+        # share of the weight for a plate.
         power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)

@@ -131,7 +131,7 @@ class _MatteModel:
         self._covariance = inverse_3x3(tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6)
 
     def _without(self, place: int) -> Doubles:
-        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are wild."""
+        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are implausible."""
         light, weights = self.lights[place], self._weights[:, place]
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
         amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
@@ -168,7 +168,7 @@ class _MatteModel:
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
     def usual_residual(self, places: Sequence[int]) -> float:
-        """Return the residual that a quarter of some images are below, where they are."""
+        """Return the lower quartile of the residuals of some images in their current positions."""
         found = [compared for compared in map(self._compared, places) if compared is not None]
         still = [compared.left[self.reach, self.reach] for compared in found]
         return float(np.quantile(still, 0.25)) if still else np.inf

@@ -111,7 +111,7 @@ class CaptureSummary:
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
-    # some of the pixels of all images, on a grid, and every pixel of the middle; None where images have different sizes
+    # some of the pixels of all images, on a grid, and every pixel of the middle; None if images have different sizes
     samples: tuple[Sample, Sample] | None
     lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
     mask_warnings: list[CaptureWarning] = field(default_factory=list)
@@ -172,7 +172,7 @@ class CaptureSummary:
 def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
-    Raises InputError where an image cannot be read, is too large or does not fit, or a lamp would be inside the object.
+    Raises InputError if an image cannot be read, is too large or does not fit, or a lamp would be inside the object.
     """
     for facts in source.facts:
         check_stored_size(*facts.size, facts.path)

@@ -48,7 +48,7 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
 
 
 def png_bytes(figure: Figure, dpi: int) -> bytes:
-    """Return a figure as a PNG file, on white whatever the user's matplotlibrc says."""
+    """Return a figure as a PNG file, on white regardless of the user's matplotlibrc."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no warning.
@@ -156,7 +156,7 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
     axes.set_yticks([])
     axes.set_facecolor("0.85")  # light gray, which the colour scale does not contain
     # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
-    # stand for a single line each.
+    # represent a single line each.
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
     if grid == "cnn-ps":
         centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2

@@ -130,7 +130,7 @@ class LaplacianSolver:
         self._far = np.concatenate([far for _, far in pairs])
         self._n_pixels = n_pixels
         self._preconditioner: Any = None
-        # The matrix always has the same pattern. A matrix of positions says which value goes where.
+        # The matrix always has the same pattern. A matrix of positions records the place of each value.
         pixels = np.arange(n_pixels, dtype=np.int32)
         rows = np.concatenate((self._near, self._far, pixels))
         columns = np.concatenate((self._far, self._near, pixels))

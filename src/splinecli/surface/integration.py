@@ -59,7 +59,7 @@ def integrate_normals(
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
         prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths like the result, NaN
-            where it is not known. The result has its shape in the large, its offset and, in depths, its scale.
+            where it is not known. The result has its large-scale shape, its offset and, for depths, its scale.
         prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer waves follow the
             prior. None for 15 % of the root of the mask's area.
         progress: see Progress. The shares may add up to less than 1.
@@ -90,7 +90,7 @@ def integrate_normals(
 def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
-    Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
+    Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
     unit in the mask, x right, y up, z to the camera, pulled to height zero. The filter's gain at k radians per pixel is
     k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
     """

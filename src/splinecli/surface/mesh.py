@@ -6,7 +6,7 @@ camera.
 
 The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser mesh. A viewer
 interpolates the unit normal N and the tangent T of the vertices over a triangle and scales both to unit length. The
-bitangent is B = N x T, which points up in the image. A texel (x, y, z) then stands for the normal x T + y B + z N, and
+bitangent is B = N x T, which points up in the image. A texel (x, y, z) then represents the normal x T + y B + z N, and
 its colour is (x + 1) / 2 and so on (glTF 2.0, section 3.9.3).
 """
 
@@ -36,7 +36,7 @@ class SurfaceMesh:
     # the top to 1 at the bottom, as in glTF
     uvs: Singles
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
-    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
+    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if `normals` are
     # exact.
     normal_texture: NDArray[np.uint8] | None = None
     tangents: Singles | None = None  # (V, 3) float32, unit; only with a normal texture
@@ -238,7 +238,7 @@ def _mesh_of_blocks(
     normal_map: Floats,
     largest_step: float | None,
 ) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
+    """Return a mesh of blocks of a large map's pixels; None if they would be too few, or the map is small.
 
     Collapsing all edges of a large map takes much memory. If far fewer triangles are requested, a mesh of the blocks,
     with at least TRIANGLES_LEFT times as many, has the same shape, and the normal texture keeps the detail.
@@ -250,7 +250,7 @@ def _mesh_of_blocks(
     of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
     of_blocks[blocks.mask] = blocks.average(pixels, mask)
-    # Without a camera, a step counts in blocks, as a pixel does.
+    # Without a camera, a step is measured in blocks, like a pixel.
     scale = step if camera_matrix is None else 1
     mesh = surface_mesh(
         of_blocks[..., 0] / scale,

@@ -288,7 +288,7 @@ def is_folder(path: Path) -> bool:
 
 
 def resolve(path: Path) -> Path:
-    """Return the path without links and "..". Raises InputError where the system refuses to answer."""
+    """Return the path without links and "..". Raises InputError if the system refuses to answer."""
     try:
         return path.resolve()
     except RuntimeError:  # for a loop of links, before Python 3.13

@@ -66,7 +66,7 @@ _GROUP_FILES = (  # the limit, the use, and the file cache within it
 
 
 def available_memory() -> float:
-    """Return the bytes of memory that this process may still use; infinity where the system does not say.
+    """Return the bytes of memory that this process may still use; infinity if the system does not report it.
 
     It is the least of the machine's free memory, the limits of the process's control groups, and the limit on its
     address space (ulimit -v).
@@ -111,7 +111,7 @@ def check_address_space() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep freed blocks for the next arrays, where it is glibc.
+    """Let the C library keep freed blocks for the next arrays, if it is glibc.
 
     By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
     third of the time of networks and of reading. Blocks above _LARGEST_KEPT are still returned.
@@ -122,7 +122,7 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Return freed blocks to the system between two stages, where the C library is glibc; see keep_freed_memory."""
+    """Return freed blocks to the system between two stages, if the C library is glibc; see keep_freed_memory."""
     _of_c_library("malloc_trim")(0)
 
 
@@ -201,7 +201,7 @@ def choose_device(name: Device | str) -> torch.device:
 
 
 def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
-    """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
+    """Return the number format of this name; "auto" is bfloat16 if the device supports it natively."""
     if name != "auto":
         return name
     import torch

@@ -229,8 +229,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
     Args:
-        report: the name of the file that describes the others: removed first, written last. None where the caller takes
-            care that no report names a file that changes.
+        report: the name of the file that describes the others: removed first, written last. None if the caller ensures
+            that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
     """
     new = NewFiles(folder)

@@ -177,7 +177,7 @@ def _check_tags(file: BinaryIO, number: int) -> None:
 
 
 def _decode_page(page: Any) -> Array | None:
-    """Return pixels (H, W) or (H, W, samples); None where tifffile has no decoder or fails."""
+    """Return pixels (H, W) or (H, W, samples); None if tifffile has no decoder or fails."""
     if int(page.photometric) == _YCBCR:
         return None
     try:

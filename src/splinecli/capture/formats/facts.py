@@ -62,14 +62,14 @@ _RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 class StatedCurve:
     """The transfer curve that a file states."""
 
-    curve: TransferCurve = 1.0  # see TransferCurve; linear where the file says nothing
+    curve: TransferCurve = 1.0  # see TransferCurve; linear if the file states none
     by: str = ""  # the source of the curve, for messages; empty for none
     unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
 _FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
 _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: _ENCODED}
-"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which goes before all else."""
+"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over all others."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class ImageFacts:
     kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
     curve: StatedCurve = StatedCurve()  # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
-    # the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is in the unit of
-    # the decoded values: full scale for a RAW file, whatever its tags say
+    # the white level of a 16-bit image, 2^bits - 1 if the file states bits; None without one. It is in the unit of
+    # the decoded values: full scale for a RAW file, regardless of its tags
     white_level: int | None = None
     # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
@@ -89,7 +89,7 @@ class ImageFacts:
 
     @property
     def stated_channels(self) -> int | None:
-        """The number of channels, with alpha; None where the header states none."""
+        """The number of channels, with alpha; None if the header states none."""
         return None if self.stated_size is None else (*self.stated_size[0], 1)[2]
 
     @cached_property
@@ -284,7 +284,7 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
 
 
 def _one_value(tag: object) -> int | None:
-    """Return the tag's value where it is one whole number, or the same one for each channel."""
+    """Return the tag's value if it is one whole number, or the same number for each channel."""
     first, *others = tag if isinstance(tag, tuple) and tag else (tag,)
     return first if isinstance(first, int) and all(other == first for other in others) else None
 
@@ -347,7 +347,7 @@ class Exposure(NamedTuple):
 
 
 def find_exposure(facts: ImageFacts) -> Exposure | None:
-    """Return the exposure of an image; None where a part of it is missing or the file is damaged."""
+    """Return the exposure of an image; None if a part of it is missing or the file is damaged."""
     try:
         if facts.exif is None and facts.kind == "RAW":
             numbers: tuple[Any, ...] = read_shot(facts.path)
@@ -361,7 +361,7 @@ def find_exposure(facts: ImageFacts) -> Exposure | None:
 
 
 def check_exposures(images: Sequence[ImageFacts]) -> None:
-    """Raise InputError where two images state different exposures."""
+    """Raise InputError if two images state different exposures."""
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
         first, expected = found[0]
@@ -395,7 +395,7 @@ def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | 
 
 
 def common_orientation(images: Sequence[ImageFacts]) -> int:
-    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT where they state none.
+    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT if they state none.
 
     The orientation of RAW files is ignored: their pixels are read in the sensor's orientation. Raises InputError for
     two images with different orientations, because their pixels do not correspond.

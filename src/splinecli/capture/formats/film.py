@@ -56,7 +56,7 @@ def is_film(path: Path) -> bool:
 def choose_frames(film: Path) -> tuple[int, ...]:
     """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights differ most.
 
-    Raises InputError where the film cannot be read, or its light does not move.
+    Raises InputError if the film cannot be read, or its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)

@@ -53,7 +53,7 @@ class ExpectedSize:
     what: str = "an image"  # description of the image, with its article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
-        """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
+        """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
             raise InputError(
                 f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
@@ -63,7 +63,7 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError where an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
+    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
     if expected is not None:
         expected.check(shape, path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
@@ -75,7 +75,7 @@ def check_stored_size(
 
 
 def check_vectors(shape: tuple[int, ...], path: Path) -> None:
-    """Raise InputError where an array is not H x W x 3."""
+    """Raise InputError if an array is not H x W x 3."""
     if len(shape) != 3 or shape[2] != 3:
         sizes = " x ".join(map(str, shape))
         raise InputError(f"found an array of {sizes}, expected a normal map, H x W x 3", path=path)
@@ -87,7 +87,7 @@ def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
 
 
 def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = None) -> None:
-    """Raise InputError where less memory is available; `takes` is the message's subject and verb."""
+    """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
         problem = f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available"
@@ -105,7 +105,7 @@ def _gigabytes(n_bytes: float) -> str:
 def common_size(images: Sequence[ImageFacts]) -> StoredSize:
     """Return the size of the largest of some images.
 
-    Raises InputError where one has another height or width than the first, is too large, or has no whole header.
+    Raises InputError if one has another height or width than the first, is too large, or has an incomplete header.
     """
     first = images[0]
     check_stored_size(*first.size, first.path)

@@ -61,7 +61,7 @@ def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, conventi
         path: any of the files above but text.
         mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
             something out, that is left out, too.
-        convention: whether green is y up or y down where the values are colours.
+        convention: whether green is y up or y down in a picture.
 
     Raises:
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
@@ -123,7 +123,7 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
             values = read_mat(path, expected)
     elif suffix == ".npy":
         with damage_as_input_error(path, "the .npy file is damaged, or contains no array of numbers"):
-            # A map of the file, which reads the header alone. It refuses a file that is shorter than its header says.
+            # A map of the file, which reads the header alone. It rejects a file that is shorter than its header states.
             array = np.lib.format.open_memmap(path, mode="r")
             check_vectors(array.shape, path)
             check_stored_size(array.shape, array.dtype.itemsize, path, expected)

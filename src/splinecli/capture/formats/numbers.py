@@ -34,7 +34,7 @@ _FROM_PIPES: dict[Path, bytes] = {}
 WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
 
 MOST_TEXT = 1_000_000
-"""Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
+"""Bytes of the longest text file that is read, unless the number of images sets the limit: 14,000 lights."""
 
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"  # hint for a line with decimal commas
 
@@ -53,7 +53,7 @@ class NumberRows:
 
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
-    names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
+    names: tuple[str, ...] | None = None  # of each row's image, without folders; None if rows begin with numbers
     intensities: Doubles | None = None  # (R, 3), RGB, of the lights of a file that has them
     are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
 
@@ -94,8 +94,8 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe instead: the shell's `<(...)`, which can be read only once.
 
-    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages say that `expected` was
-    expected.
+    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages name `expected` as the
+    expected content.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
