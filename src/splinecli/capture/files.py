@@ -30,7 +30,7 @@ _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # treated as images only in a folder without others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
-_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
 IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
 
 _DIGITS = re.compile(r"([0-9]+)")
@@ -175,7 +175,7 @@ GROUND_TRUTH = tuple(
 )
 
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
-"""Names of folders that contain the images of the capture that is the folder around them; the first is PSBox's."""
+"""Names of subfolders with the images of a capture, whose other files are in the parent; the first is PSBox's."""
 
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
@@ -250,7 +250,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
     """Return a mask for photographs without one of a usual name, and a warning that names it; None if none is found.
 
     It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
-    name; or else the alpha channel of the first photograph. Of several pictures, none is chosen.
+    name; or else the alpha channel of the first photograph. If several pictures match, none is chosen.
     """
     name, of_images = folder_name(folder).lower(), images[0].parent
     entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
@@ -263,7 +263,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
         masks = [path for path in named if read_facts(path).size[0][:2] == size[:2]]
         if not named and read_facts(images[0]).stated_channels in (2, 4):
             masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
-    except InputError:  # reading the images names the damage
+    except InputError:  # reading the images reports the damage
         return None, ()
     if not masks:
         return None, ()
@@ -276,7 +276,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", ".." and a trailing slash, of a link its name. Raises InputError."""
+    """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name. Raises InputError."""
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"
 
@@ -287,7 +287,7 @@ LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its con
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
     """Return JSON values that change when a file of the capture does. Compute them before reading the files.
 
-    Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
+    Images and flat fields are stamped by path, size and modification time, because reading them is slow. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
 
     Raises:
@@ -302,7 +302,7 @@ def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or the path, size and time of change of a very large one. Raises InputError."""
+    """Return the SHA-256 of a file, or the path, size and modification time of a very large one. Raises InputError."""
     check_file(path, "a file", pipe=True)
     if is_substitution(path):
         return hashlib.sha256(read_text(path)).hexdigest()

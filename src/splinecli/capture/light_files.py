@@ -150,7 +150,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
     return None
 
 
-_STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
+_STRONGEST = 1e12  # largest intensity; it and its inverse are within float32's range
 
 
 def read_light_directions(
@@ -164,7 +164,7 @@ def read_light_directions(
     gives their order. Vectors may have any length above zero.
 
     Args:
-        n_images: the number of lights that is expected, if it is known.
+        n_images: the expected number of lights, if it is known.
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
@@ -244,7 +244,7 @@ def unit_directions(
         InputError: a zero vector, or a light that is not above the horizon.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    # First divide by the largest component, because squares of very large or small ones leave float64's range.
+    # First divide by the largest component, because squares of very large or small ones exceed float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
     if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= _MOST_BAD * len(directions):

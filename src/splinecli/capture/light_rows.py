@@ -78,7 +78,7 @@ PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in pro
 def parse_light_frame(text: str | None) -> LightFrame:
     """Return the frame of a list such as "x-left,y-down,exchanged"; the usual one of None.
 
-    Axes that the list does not name are as usual. Raises UsageError for an unknown word, and an axis that comes twice.
+    Axes that the list does not name are as usual. Raises UsageError for an unknown word or a repeated axis.
     """
     if text is None:
         return USUAL_FRAME

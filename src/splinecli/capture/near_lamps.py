@@ -177,7 +177,7 @@ UNIT_HINT = (
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Warn of lamps that are hardly possible over an object with this mask (H, W), from a file of positions, if any.
+    """Warn of implausible lamps over an object with this mask (H, W), from a file of positions, if any.
 
     Raises InputError if a lamp would be inside the object or hide it from the camera.
     """
@@ -235,7 +235,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
 LOBES = ("light_lobes.txt",)
-_MOST_NARROW = 100  # the exponent of a lamp that has half of its light 7 degrees off its axis
+_MOST_NARROW = 100  # the exponent of a lamp whose intensity halves 7 degrees off its axis
 
 SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
 

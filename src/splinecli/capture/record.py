@@ -1,5 +1,5 @@
-"""The record that all steps after reading work on, its version with the values that files store, and lights estimated
-from the images."""
+"""The capture record that all steps after reading use, the same with stored values, and lights estimated from the
+images."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ class Capture:
             positions: zero-based positions among this record's lights, not indices in the whole capture.
 
         Raises:
-            UsageError: a position is out of range, comes twice, or there are fewer than three.
+            UsageError: a position is out of range or repeated, or there are fewer than three.
             InputError: the chosen lights are coplanar.
         """
         chosen = list(check_light_indices(positions, self.n_lights))
@@ -258,7 +258,7 @@ def in_one_plane(light_directions: Doubles) -> bool:
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
     """Return the indices as a tuple of ints, in their order.
 
-    Raises UsageError if an index is not below n_lights or comes twice, or if there are fewer than three.
+    Raises UsageError if an index is repeated or not below n_lights, or if there are fewer than three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):

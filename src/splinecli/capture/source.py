@@ -104,7 +104,7 @@ class CaptureSource:
                 are estimated (see estimate_light_intensities).
 
         Raises:
-            UsageError: an index is out of range, comes twice, or there are fewer than three.
+            UsageError: an index is out of range or repeated, or there are fewer than three.
             InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or Capture
                 rejects the lights.
         """

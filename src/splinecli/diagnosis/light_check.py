@@ -237,7 +237,7 @@ def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | Non
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
+    # Among near equals, a frame is preferred, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
     if better and better[0].advantage > (simple[0].advantage if simple else 0) + FRAME.told_apart:

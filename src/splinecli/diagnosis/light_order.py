@@ -1,8 +1,7 @@
 """Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are shifted.
 
-Rings of a dome that are shifted or mirrored against the others in the light file. A wrong order or frame of all lights
-is found here and by light_check.py. In a dome, single rings may also begin at another lamp, or run the other
-way round.
+A wrong order or frame of all lights is found here and by light_check.py. In a dome, single rings may also be shifted or
+mirrored against the others in the light file, because they begin at another lamp or run the other way round.
 
 Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
 others, as a brighter lamp would. For metals, this distinguishes right lights from wrong ones far better than known

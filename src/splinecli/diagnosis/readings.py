@@ -189,7 +189,7 @@ class Readings:
         fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the place as the light of near lamps does. An object is round if its normals
+        # On a ball, gloss varies with the position, like the light of near lamps. An object is round if its normals
         # predict this share of the variance of the places; then near lamps cost so much more.
         cost = 1.9 if _roundness(best.normals, places) > 0.85 else 0.0
         # At an end of WIDTHS, the residual may fall beyond.

@@ -15,7 +15,7 @@ from splinecli.errors import InputError
 from splinecli.maths import Bools, Doubles, Floats
 from splinecli.restoration.images import Saturation, WhiteLevel, find_object, find_saturated, white_level_warnings
 
-MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
+MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
 
 

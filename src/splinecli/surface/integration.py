@@ -27,7 +27,7 @@ _STILL = 0.002  # pixels: the rms movement at which the surface is finished
 _COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 _SOLVES_OF_COARSEST = 150
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
-_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; float32 keeps no more than whole numbers above
+_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
 _FARTHEST = 3.0  # from the median height to any other, in the larger of the mask's width and height
 
 RELIEF_WIDTH = 64.0

@@ -115,7 +115,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 def sync(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk. Raises OSError."""
     windows = os.name == "nt"
-    if windows and path.is_dir():  # Windows opens no folders
+    if windows and path.is_dir():  # Windows cannot open folders
         return
     handle = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
     try:

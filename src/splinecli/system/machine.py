@@ -43,7 +43,7 @@ def import_extra(
     """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
 
     Raises UsageError or `error` if the module is not installed. The message names the command that installs it, the
-    file at `path` that cannot be read without it, and `otherwise`, another way out.
+    file at `path` that cannot be read without it, and `otherwise`, an alternative.
     """
     try:
         return importlib.import_module(module)
@@ -262,8 +262,8 @@ _lock, _users, _threads = Lock(), 0, 0
 def one_thread_each() -> Iterator[int]:
     """Let each operation of PyTorch use one thread only. Yields the number of threads that it used before.
 
-    Operations on small arrays are hardly faster on more, and on a busy machine many times as slow, because all threads
-    of an operation wait for the slowest.
+    More threads hardly speed up operations on small arrays, and on a busy machine they are many times slower, because
+    all threads of an operation wait for the slowest.
     """
     import torch
 

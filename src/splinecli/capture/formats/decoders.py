@@ -226,7 +226,7 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
     """
     with _libraw(path) as rawpy:
-        with native_stderr():  # not longer, because it stops progress bars, too
+        with native_stderr():  # kept short, because it also blocks progress bars
             raw = rawpy.imread(io.BytesIO(content))
             raw.unpack()
         with raw:

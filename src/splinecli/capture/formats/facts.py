@@ -94,7 +94,7 @@ class ImageFacts:
 
     @cached_property
     def size(self) -> StoredSize:
-        """The size as stored. Raises InputError for a damaged file. Opening a RAW file takes long."""
+        """The size as stored. Raises InputError for a damaged file. Opening a RAW file is slow."""
         if self.damage is not None:
             raise self.damage
         if self.kind == "RAW":
@@ -123,7 +123,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         file.seek(0)
         if not start:
             raise InputError("the file is empty", path=path)
-        otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
+        otherwise = "TGA" if suffix == ".tga" else None  # TGA files have no signature
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
             found = _BRANDS.get(start[8:], found)

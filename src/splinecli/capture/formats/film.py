@@ -1,6 +1,6 @@
 """Films as captures: a fixed camera films an object while a lamp is carried around it.
 
-Of hundreds of frames, few are needed: sharp ones, not overexposed, whose light differs as much as possible.
+Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as different as possible.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST_FRAMES, FEWEST_FRAMES = 24, 6
 LEAST_DIFFERENCE = 0.05
 """Distance between two frames' thumbnails of unit length below which their light is considered the same."""
 
-_CANDIDATES = 1000  # frames that are compared; of a longer film, one of two, of four and so on
+_CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
 _THUMBNAIL, _SMALL = 64, 512  # longest sides in pixels: of shading, of sharpness and exposure
 _NEIGHBOURS = 7  # frames before and after, whose light is similar
 _LEAST_READ = 0.8  # share of the frames that the film states
@@ -85,7 +85,7 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
     with _opened(film) as video:
         place = 0
         for number in numbers:
-            with native_stderr():  # not longer, because it stops progress bars, too
+            with native_stderr():  # kept short, because it also blocks progress bars
                 while place <= number and video.grab():
                     place += 1
                 if place <= number:

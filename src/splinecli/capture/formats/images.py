@@ -110,7 +110,7 @@ def common_size(images: Sequence[ImageFacts]) -> StoredSize:
     first = images[0]
     check_stored_size(*first.size, first.path)
     expected = ExpectedSize(first.size[0], first.path.name)
-    # Opening a RAW file takes long. Its size is compared when it is decoded.
+    # Opening a RAW file is slow, so its size is compared when it is decoded.
     asked = [first, *(image for image in images[1:] if image.kind != "RAW")]
     for image in asked[1:]:
         expected.check(image.size[0], image.path)
@@ -135,7 +135,7 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
 
     Raises:
         InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
-            image has not the expected size, or is too large (see check_stored_size).
+            image does not have the expected size, or is too large (see check_stored_size).
     """
     return decode_with_alpha(path, expected)[0]
 
@@ -293,8 +293,8 @@ def to_linear(stored: Array, path: Path) -> Singles:
 def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
-    So 0 and 1 serve as well as 0 and 255. If an alpha channel cuts something out, it alone is the mask, because colours
-    mean nothing in such an image.
+    So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the mask, because
+    colours mean nothing in such an image.
 
     Raises:
         InputError: the image cannot be read, or no pixel is above zero.
