@@ -262,7 +262,7 @@ _lock, _users, _threads = Lock(), 0, 0
 def one_thread_each() -> Iterator[int]:
     """Let each operation of PyTorch use one thread only. Yields the number of threads that it used before.
 
-    More threads hardly speed up operations on small arrays, and on a busy machine they are many times slower, because
+    More threads hardly speed up operations on small arrays, and on a busy machine make them many times slower, because
     all threads of an operation wait for the slowest.
     """
     import torch
