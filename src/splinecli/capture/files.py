@@ -1,4 +1,4 @@
-"""The files of a capture: their names, by which they are recognised, and their stamps, by which changes are."""
+"""The files of a capture: names, which identify their roles, and stamps, which reveal changes."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from splinecli.system.files import check_file, file_sha256, find_mode, is_found_
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # images only where a folder has no others
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # treated as images only in a folder without others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
-_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
 IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
 
 _DIGITS = re.compile(r"([0-9]+)")
@@ -50,7 +50,7 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 def list_folder(folder: Path) -> list[Path]:
     """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
 
-    Raises InputError where the folder is missing, is a file, or cannot be read.
+    Raises InputError if the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
@@ -66,9 +66,9 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
-    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is a
-    copy that the camera or a viewer made, and does not count. What is left out has another meaning, by its stem in
-    lower case, such as "mask", or as a file that the user named.
+    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is
+    treated as a copy made by the camera or a viewer, and ignored. Also excluded are files with another role, either by
+    their lower-case stem, such as "mask", or because the user named them.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -108,7 +108,7 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise NoImagesError if there are no images."""
+    """Raise NoImagesError for an empty list of images."""
     if not images:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
         found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
@@ -175,7 +175,7 @@ GROUND_TRUTH = tuple(
 )
 
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
-"""Names of folders that contain the images of the capture that is the folder around them; the first is PSBox's."""
+"""Names of subfolders with the images of a capture, whose other files are in the parent; the first is PSBox's."""
 
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
@@ -190,27 +190,27 @@ results may be the same."""
 class CaptureFiles:
     """The files of one capture, with the images in the order of the lights."""
 
-    layout: str  # name of the arrangement of files, for people
-    name: str  # name of the capture, in most layouts that of its folder
+    layout: str  # readable name of the arrangement of files
+    name: str  # name of the capture, in most layouts the folder's name
     folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
-    # F x 3 text, or a file that names images, which sets the order of the images; None where no lights are needed
+    # F x 3 text, or a file that names images, which sets the order of the images; None if no lights are needed
     light_directions: Path | None
-    light_intensities: Path | None = None  # F x 3 text, or None where no file gives them
-    mask: Path | None = None  # an image, or None where every pixel counts
+    light_intensities: Path | None = None  # F x 3 text, or None if no file gives them
+    mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
     boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
-    others: tuple[Path, ...] = ()  # pictures beside the images whose names say that they are no photographs
+    others: tuple[Path, ...] = ()  # pictures beside the images that are not photographs, judging by their names
     kept: tuple[int, ...] | None = None  # zero-based places in the light file of the images; None for all
-    warnings: tuple[CaptureWarning, ...] = ()  # what was chosen among files whose names are not the usual ones
+    warnings: tuple[CaptureWarning, ...] = ()  # choices made among files with unusual names
 
 
 @dataclass(frozen=True)
 class Overrides:
     """Files named by the user, which replace those in the folder.
 
-    Without needs_lights, light files in the folder do not count, and none is missed.
+    Without needs_lights, light files in the folder are ignored, and a missing one is not an error.
     """
 
     lights: Path | None = None
@@ -220,7 +220,7 @@ class Overrides:
     needs_lights: bool = field(default=True, kw_only=True)
 
     def named(self) -> tuple[Path, ...]:
-        """Return the files that are given. Raises InputError for one that is no file."""
+        """Return the files that are given. Raises InputError for a path that is not a file."""
         files = tuple(f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None)
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
@@ -240,21 +240,21 @@ _MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
 
 
 def is_mask_name(path: Path) -> bool:
-    """Return whether a picture's name has the word "mask", as NAME_mask.png and chrome.mask.tga, but is no result."""
+    """Return whether a picture's name has the word "mask", as in NAME_mask.png, and is not one of our results."""
     stem = path.stem.lower()
     is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
     return is_picture and _MASK_WORD.search(stem) is not None
 
 
 def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return the mask of photographs that have none with a usual name, and a warning that says which; None for none.
+    """Return a mask for photographs without one of a usual name, and a warning that names it; None if none is found.
 
     It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
-    name; or else the alpha channel of the first photograph. Of several pictures, none is chosen.
+    name; or else the alpha channel of the first photograph. If several pictures match, none is chosen.
     """
     name, of_images = folder_name(folder).lower(), images[0].parent
     entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
-    with suppress(InputError):  # what is beside a folder is not always ours to read
+    with suppress(InputError):  # we may lack permission to read the parent folder
         around = list_folder(folder.absolute().parent)
         entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
     named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
@@ -263,7 +263,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
         masks = [path for path in named if read_facts(path).size[0][:2] == size[:2]]
         if not named and read_facts(images[0]).stated_channels in (2, 4):
             masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
-    except InputError:  # reading the images names the damage
+    except InputError:  # reading the images reports the damage
         return None, ()
     if not masks:
         return None, ()
@@ -276,7 +276,7 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", ".." and a trailing slash, of a link its name. Raises InputError."""
+    """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name. Raises InputError."""
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"
 
@@ -285,9 +285,9 @@ LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its con
 
 
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
-    """Return JSON values that change when a file of the capture does. Take them before the files are read.
+    """Return JSON values that change when a file of the capture does. Compute them before reading the files.
 
-    Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
+    Images and flat fields are stamped by path, size and modification time, because reading them is slow. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
 
     Raises:
@@ -302,7 +302,7 @@ def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or the path, size and time of change of a very large one. Raises InputError."""
+    """Return the SHA-256 of a file, or the path, size and modification time of a very large one. Raises InputError."""
     check_file(path, "a file", pipe=True)
     if is_substitution(path):
         return hashlib.sha256(read_text(path)).hexdigest()

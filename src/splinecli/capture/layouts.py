@@ -52,7 +52,7 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
-    Raises InputError where a file is missing, there are several such folders, or the images do not match the lights.
+    Raises InputError if a file is missing, there are several such folders, or the images do not match the lights.
     """
     captures = list_cyclesps(folder)
     if captures is None:
@@ -148,9 +148,9 @@ _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all
 """Words in the names of pictures that other programs leave beside the photographs."""
 
 _RESULT_WORDS = frozenset({"demo", "result", "results"})
-"""The same, where no light file says how many photographs there are."""
+"""The same, if no light file gives the number of photographs."""
 
-_MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
+_MOST_OTHERS = 0.25  # share of the images; if more names have these words, they are photographs
 
 
 PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
@@ -163,14 +163,14 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
-    Raises InputError where the folder is missing, is a file or contains no images; filenames.txt names an image that
-    does not exist; there is no light file; or a file of the overrides does not exist.
+    Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
+    does not exist; the light file is missing; or a file of the overrides does not exist.
     """
     folder = Path(folder)
-    list_folder(folder)  # raises where it is no folder
+    list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
-        # The plain folder comes last, because it takes any folder with images.
+        # The plain folder comes last, because it accepts any folder with images.
         return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
     except NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
@@ -181,13 +181,13 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the capture's name: that of the folder or the film; in CyclesPS <object>_<kind>. Raises InputError."""
+    """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
     return folder.stem if is_film(folder) else cyclesps_name(folder) or _own_name(folder)
 
 
 def _own_name(folder: Path) -> str:
-    """Return the name of a folder, of a folder `images` that of the folder around it. Raises InputError."""
+    """Return the name of a folder, or its parent's name if the folder is called `images`. Raises InputError."""
     name = folder_name(folder)
     return folder_name(_parent(folder)) if name in IMAGE_FOLDERS and _parent(folder) != folder else name
 
@@ -201,12 +201,12 @@ def _images_folder(folder: Path) -> Path | None:
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """Return the captures of a dataset's folder in natural order; the folder alone where it is a capture itself.
+    """Return the captures of a dataset's folder in natural order; only the folder itself if it is a capture.
 
     A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
     or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
-    captures are found by names of files; reading one may still fail. A subfolder that cannot be listed counts as a
-    capture, so that the caller reports it when it reads it.
+    captures are found by names of files; reading one may still fail. A subfolder that cannot be listed is treated as a
+    capture, so that the caller reports the error on reading it.
 
     Raises:
         InputError: the folder is missing, is a file, or contains no capture.
@@ -251,7 +251,7 @@ def _captures_below(folder: Path) -> list[Path]:
 
 
 def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
-    """Return the capture's files. Raises InputError where there are no images or lights, or filenames.txt is wrong.
+    """Return the capture's files. Raises InputError if images or lights are missing, or filenames.txt is wrong.
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
@@ -302,9 +302,9 @@ def _gather(
     ground_truth: Sequence[str] = GROUND_TRUTH,
     others: tuple[Path, ...] = (),
 ) -> CaptureFiles:
-    """Return the capture's files: the images, the lights, and what else the folder has.
+    """Return the capture's files: the images, the lights, and any optional files in the folder.
 
-    Files that the user names come before those of the folder.
+    Files named by the user take precedence over files in the folder.
     """
     mask, warnings = overrides.mask or find_named(folder, MASK), tuple[CaptureWarning, ...]()
     if mask is None:

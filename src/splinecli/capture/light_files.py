@@ -69,12 +69,12 @@ def _encode_npy(directions: Doubles, images: Sequence[Path]) -> bytes:
 class LightFormat:
     """A format of light files. To add one, write its reader and a row of FORMATS."""
 
-    name: str  # for people
+    name: str  # for messages
     suffixes: tuple[str, ...]  # in lower case; none for the format of all files with a suffix that no other row has
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
     found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
-    rank: int = 0  # files of a lower rank are found first. In rank 0, names count in order; in others, two are an error
-    recognise: Callable[[Path], bool] = Path.exists  # says by content which of the formats of one suffix a file has
+    rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
+    recognise: Callable[[Path], bool] = Path.exists  # decides by content between formats with one suffix
     encode: Callable[[Doubles, Sequence[Path]], bytes] | None = None  # directions (F, 3) of images; None if only read
 
 
@@ -93,7 +93,7 @@ FORMATS = (
     LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
     LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )
-"""All formats of light files. What they are called, how they are found, read and written follows from this table."""
+"""All formats of light files. This table defines how they are named, found, read and written."""
 
 
 def format_of(path: Path) -> LightFormat:
@@ -150,7 +150,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
     return None
 
 
-_STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
+_STRONGEST = 1e12  # largest intensity; it and its inverse are within float32's range
 
 
 def read_light_directions(
@@ -164,13 +164,13 @@ def read_light_directions(
     gives their order. Vectors may have any length above zero.
 
     Args:
-        n_images: the number of lights that is expected, if it is known.
+        n_images: the expected number of lights, if it is known.
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
-        InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
-            vector or a light below the horizon; also where the count disagrees with the count line or with
-            n_images, and for angles that are read as vectors.
+        InputError: with the line, for a wrong number of columns, a word that is not a finite number, a zero vector or a
+            light below the horizon; also if the count disagrees with the count line or with n_images, and for angles
+            that are read as vectors.
     """
     return lights_of(read_light_table(Path(path), n_images, form), n_images, frame, form)[1]
 
@@ -244,7 +244,7 @@ def unit_directions(
         InputError: a zero vector, or a light that is not above the horizon.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    # First divide by the largest component, because squares of very large or small ones leave float64's range.
+    # First divide by the largest component, because squares of very large or small ones exceed float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
     if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= _MOST_BAD * len(directions):
@@ -271,7 +271,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> Doubles:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
-    with the line for an intensity that is no usable number.
+    with the line for an unusable intensity.
     """
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
@@ -353,15 +353,15 @@ class NamedLights:
 
     path: Path
     names: tuple[str, ...]  # names of the images, without folders
-    lines: tuple[int | None, ...]  # the line of each light in the file; None for each where the file has no lines
+    lines: tuple[int | None, ...]  # the line of each light in the file; None for each if the file has no lines
     directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
-    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None where the file has none
+    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None if the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
 
-        Images that no light names are left out, unless they are matched by order. Raises InputError where two lights
-        have one name, or neither the names nor the number of images fit.
+        Images that no light names are left out, unless they are matched by order. Raises InputError if two lights have
+        the same name, or neither the names nor the number of images fit.
         """
         lines: dict[str, int | None] = {}
         for name, line in zip(self.names, self.lines, strict=True):

@@ -110,7 +110,7 @@ def is_dome(path: Path) -> bool:
 def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up) and z (camera).
 
-    Positions are taken for positions of lamps. ledAdjust, by which Relight multiplies the images, gives intensities.
+    Positions are interpreted as lamp positions. ledAdjust, by which Relight multiplies the images, gives intensities.
     """
     document = _read_document(path)
     if not isinstance(document, dict):
@@ -131,7 +131,7 @@ def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 
 
 def is_list(path: Path) -> bool:
-    """Return whether a JSON file is a plain list of lights; see read_json_list."""
+    """Return whether a JSON file has the form that read_json_list reads."""
     return _listed(_read_document(path)) is not None
 
 
@@ -198,7 +198,7 @@ def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> 
 
 
 # OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
-# No part may run over what another one begins with: a file of 1 MB would take minutes.
+# No part may match the start of another one: the backtracking would take minutes for a file of 1 MB.
 _YAML = re.compile(
     r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
     r"\s+data:\s*\[([^][:]*)\]",

@@ -29,7 +29,7 @@ AXIS_WORDS = {
     "z-camera": (2, 1),
     "z-away": (2, -1),
 }
-"""What --light-frame takes: the axis of the file and the sign with which it enters."""
+"""The words of --light-frame: an axis of the file, and its sign in the usual frame."""
 
 EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
 
@@ -39,7 +39,7 @@ class LightFrame:
     """The frame of a light file."""
 
     signs: tuple[int, int, int] = (1, 1, 1)  # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
-    exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
+    exchanged: bool = False  # whether the file has y before x. The signs belong to x and y in either order
 
     @property
     def matrix(self) -> Doubles:
@@ -48,7 +48,7 @@ class LightFrame:
         return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
 
     def __str__(self) -> str:
-        """Return the value of --light-frame, such as "x-left,y-down"; only what differs from the usual frame."""
+        """Return the value of --light-frame, such as "x-left,y-down", without axes that are as usual."""
         words = [EXCHANGED] if self.exchanged else []
         words += [name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1]
         return ",".join(words) or "x-right,y-up"
@@ -62,7 +62,7 @@ class LightFrame:
         return ", ".join(parts)
 
     def after(self, first: LightFrame) -> LightFrame:
-        """Return the frame that stands for `first` and then this one."""
+        """Return the composition of `first` and then this frame."""
         x, y, z = (int(sign) for sign in (self.matrix @ first.matrix).sum(axis=1))
         return LightFrame((x, y, z), self.exchanged != first.exchanged)
 
@@ -78,7 +78,7 @@ PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in pro
 def parse_light_frame(text: str | None) -> LightFrame:
     """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual one of None.
 
-    Axes that the list does not name are as usual. Raises UsageError for an unknown word, and an axis that comes twice.
+    Axes that the list does not name are as usual. Raises UsageError for an unknown word or a repeated axis.
     """
     if text is None:
         return USUAL_FRAME
@@ -119,8 +119,8 @@ AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format az
 def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:
     """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
 
-    Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
-    slant from the camera axis.
+    Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane towards the camera,
+    and the slant from the camera axis.
     """
     azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
     level = np.cos(elevation)
@@ -133,7 +133,7 @@ def _azimuth_elevation(row: Sequence[float], form: RowForm) -> tuple[float, floa
 
 
 def check_angles(table: NumberRows, form: RowForm) -> None:
-    """Raise InputError, with the line, for rows whose last two columns are no such angles."""
+    """Raise InputError, with the line, for rows whose last two columns are not valid angles."""
     for row in table.rows:
         first, second = row.numbers[-2:]
         azimuth, elevation = _azimuth_elevation(row.numbers, form)
@@ -152,7 +152,7 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
 
 
 def zenith_as_elevation(light_directions: Doubles) -> Doubles:
-    """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
+    """Return lights (..., 3) with each light's elevation as its angle from the camera axis."""
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
     across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
     return np.concatenate((across, level), axis=-1)
@@ -164,7 +164,7 @@ def lights_of_half_vectors(half_vectors: Doubles) -> Doubles:
 
 
 def refuse_angles(table: NumberRows) -> None:
-    """Raise InputError for rows that are plainly angles: two columns, or with a count, or with one radius for all."""
+    """Raise InputError for rows that are clearly angles: two columns, or with a count, or with one radius for all."""
     rows = [row.numbers for row in table.rows]
     lengths = {len(row) for row in rows}
     if len(rows) <= 3 or lengths not in ({2}, {3}):
@@ -208,8 +208,8 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
         n_numbers: the number of numbers that follow a name.
 
     Raises:
-        InputError: with the line, for a word that is no finite number; also for a file without rows, and for a header
-            or rows that are plainly other angles than expected.
+        InputError: with the line, for a word that is not a finite number; also for a file without rows, and for a
+            header or rows that are clearly other angles than expected.
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
@@ -221,7 +221,7 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
             problem = f'found the column "{found[:40]}", expected azimuth and elevation'
             hint = "The elevation is 90 minus the angle from the camera axis"
             raise InputError(problem, path=path, line=line, hint=hint)
-    # A count may stand before rows with names.
+    # A count may precede rows with names.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
     if body and all(to_number(words[0]) is None for *_, words in body):
         if all(len(words) > n_numbers for *_, words in body):
@@ -256,7 +256,7 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
 
 
 def image_name(text: str, numbers: list[str]) -> str:
-    """Return what stands before the last numbers of a row, without folders, quotes and separators."""
+    """Return the image name before the last numbers of a row, without folders, quotes and separators."""
     for word in reversed(numbers):
         text = text.rstrip(" \t,;")[: -len(word)]
     return _FOLDERS.split(text.strip(" \t,;\"'"))[-1]

@@ -1,5 +1,5 @@
 """Observations from images: decode, take the window and the mask, invert the transfer curve, subtract ambient light,
-divide by the falloff and by the light's intensity. Files and arrays have the last step in common."""
+divide by the falloff and by the light's intensity. The last step is shared by files and arrays."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ _SCALE, _CROP = re.compile(r"1(?:/(\d{1,3}))?"), re.compile(r"\d{1,9}(?:,\d{1,9}
 
 @dataclass(frozen=True)
 class Window:
-    """Which pixels of the images are read. Pixels are left out, not averaged, so values are those of the files."""
+    """The pixels of the images that are read. Images are subsampled without averaging, so stored values are kept."""
 
     box: tuple[int, int, int, int] | None = None  # left, top, width and height in pixels; None for whole images
     step: int = 1  # one of so many rows and columns is read
-    shape: tuple[int, ...] | None = None  # (H, W) of the whole images, where they are not read as a whole
+    shape: tuple[int, ...] | None = None  # (H, W) of the whole images, if only a part is read
 
     @property
     def is_whole(self) -> bool:
         return self.box is None and self.step == 1
 
     def in_words(self) -> str | None:
-        """Return what is read, for people; None for whole images."""
+        """Return a description of the window for messages; None for whole images."""
         words = []
         if self.box is not None:
             left, top, width, height = self.box
@@ -50,31 +50,31 @@ class Window:
         return ", ".join(words) or None
 
     def of(self, pixels: NDArray[Numbers]) -> NDArray[Numbers]:
-        """Return the part of an image or map (H, W, ...) that is read, as a view."""
+        """Return the window of an image or map (H, W, ...), as a view."""
         left, top, width, height = self.box or (0, 0, pixels.shape[1], pixels.shape[0])
         return pixels[top : top + height : self.step, left : left + width : self.step]
 
     def whole(self, mask: Bools) -> Bools:
-        """Return the mask of whole images from a mask of what is read."""
+        """Return the mask of whole images from a mask of the window."""
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         self.of(whole)[...] = mask
         return whole
 
     def camera(self, matrix: Floats) -> Doubles:
-        """Return the camera matrix (3, 3) of what is read, from that of whole images."""
+        """Return the camera matrix (3, 3) of the window, from the matrix of whole images."""
         left, top, *_ = self.box or (0, 0)
         to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
         return np.asarray(to_window @ matrix, np.float64)
 
     def filled(self, mask: Bools) -> Bools:
-        """Return the mask of whole images from a mask of what is read. A pixel stands for those left out beside it."""
+        """Return the mask of whole images from a mask of the window. Each pixel represents its skipped neighbours."""
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         part = replace(self, step=1).of(whole)
         part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
         return whole
 
     def on(self, image: ImageFacts) -> Window:
-        """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
+        """Return the window on images of the size of this one. Raises InputError if the box is not inside."""
         if self.is_whole:
             return self
         height, width = shape = image.size[0][:2]
@@ -120,7 +120,7 @@ class RadiometricCalibration:
     ambient: Path | None = None  # an image under ambient light alone, which is subtracted from all others
     # images of an evenly white surface, one for each light or one for all. Images are divided by them
     flat_field: tuple[Path, ...] = ()
-    automatic: bool = False  # whether the curve that all images state is used in place of `curve`
+    automatic: bool = False  # whether the curve that all images state is used instead of `curve`
 
     def with_stated_curve(self, images: Sequence[ImageFacts]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
@@ -152,16 +152,16 @@ class RadiometricCalibration:
         return self, warnings
 
 
-AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images say otherwise
+AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images state a curve
 AS_STORED = RadiometricCalibration()  # stored values are linear light
 
 EVERY_PIXEL = slice(None)
 
 
 _MIDDLE_OF_8_BITS = np.float32(0.25 / 255)
-"""Nothing tells whether linear 8-bit values were rounded, or cut as `image >> 8` does. A value v stands for light
-between v - 0.5 and v + 0.5, or between v and v + 1. A quarter of a step is half of the mistake in both cases, which
-turns normals where a pixel is dark."""
+"""Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does not record which. A
+value v then represents light between v - 0.5 and v + 0.5, or between v and v + 1. Adding a quarter of a step halves the
+error in both cases; in dark pixels, this error changes the normals."""
 
 
 def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Singles:
@@ -180,7 +180,7 @@ def take_pixels(image: Array, mask: Bools) -> Array:
 
 
 def take_around(image: Array, around: Bools) -> Array:
-    """Return the pixels (R, C) around the object. Values that are no light, such as NaN, become 0: no pixel is lost."""
+    """Return the pixels (R, C) around the object. Invalid values, such as NaN, become 0, so every pixel is kept."""
     pixels = take_pixels(image, around)
     if pixels.dtype.kind == "f":
         pixels = np.where(np.isfinite(pixels) & (pixels > 0), pixels, 0).astype(pixels.dtype)
@@ -198,7 +198,7 @@ def pixel_reader(
 ) -> Callable[[Path, int], tuple[Array, Singles]]:
     """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
 
-    Of linear light, it returns the `wanted` pixels alone, or all of them and then those of the mask `around` (H, W).
+    The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the mask `around` (H, W).
 
     The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
     image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
@@ -245,9 +245,9 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    linear: Singles  # (P, C) float32, linear light; or (p, C) of the pixels that were wanted; see pixel_reader
+    linear: Singles  # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
     intensity: Doubles  # (3,), RGB, of the light
-    stated_white_level: int | None = None  # the white level that the file states; None where it states none
+    stated_white_level: int | None = None  # the white level that the file states, or None
 
     def observe(self) -> Singles:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
@@ -260,7 +260,7 @@ class StoredPixels:
         return self.linear @ weights.astype(np.float32)
 
     def find_saturated(self, white_level: float | None) -> ImageValues:
-        """Return what decides which pixels are saturated; see look_at. Raises InputError."""
+        """Return the image statistics that decide which pixels are saturated, from look_at. Raises InputError."""
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
     def colours(self) -> Singles:
@@ -280,8 +280,8 @@ def collect_observations(
 
     The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are not divided out.
 
-    Only one image is in memory at a time. The white level is that of the user; None to find it. Raises InputError where
-    it is above an image's full scale.
+    Only one image is in memory at a time. The white level is given by the user, or None to find it. Raises InputError
+    if it is above an image's full scale.
     """
     observations = np.empty((n_pixels + n_around, n_images), np.float32)
     any_8_bit, found, colours = False, list[ImageValues](), list[Singles]()

@@ -1,8 +1,8 @@
-"""Lamps at arm's length: their positions, the scale that ties pixels to the unit of the positions, their files, and
-whether they can be where their positions say.
+"""Lamps at arm's length: their positions, the scale that relates pixels to the unit of the positions, their files, and
+checks that the positions are plausible.
 
-The frame is that of light directions: x right, y up, z to the camera. The origin lies on the object's mean plane, at
-the centre of the image. Positions may be in any unit, such as millimetres.
+The frame is the same as for light directions: x right, y up, z to the camera. The origin is on the object's mean plane,
+at the centre of the image. Positions may be in any unit, such as millimetres.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class NearLamps:
 
     positions: Doubles  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
     pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
-    middle: tuple[float, float]  # row and column of the origin, in pixels of what was read
+    middle: tuple[float, float]  # row and column of the origin, in pixels of the window that was read
     # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
     reference_distances: Doubles
     camera_matrix: Doubles | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
     points: Singles | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
     # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
-    # is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
-    # lamps that shine alike in all directions
+    # is cos(a)^mu, the model of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
+    # lamps that emit equally in all directions
     lobes: Doubles | None = None
 
     def __post_init__(self) -> None:
@@ -74,8 +74,8 @@ class NearLamps:
         """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
         Args:
-            equal: whether the light intensities are unknown, so that all lamps count as equally strong along their
-                axes. Otherwise each intensity holds at the origin, where a gray card would measure it.
+            equal: whether the light intensities are unknown, so that all lamps are assumed to be equally bright along
+                their axes. Otherwise each intensity holds at the origin, where a gray card would measure it.
         """
         distances = np.linalg.norm(positions, axis=1)
         if equal:
@@ -129,7 +129,7 @@ class NearLamps:
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
     def angles_across_deg(self, mask: Bools) -> Doubles:
-        """Return for each lamp (F,) how far its direction differs, at most, from that at the middle of the object.
+        """Return the largest deviation of each lamp's direction (F,) from its direction at the middle of the object.
 
         Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
         """
@@ -139,10 +139,10 @@ class NearLamps:
         return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
 
     def light_at(self, points: Floats) -> tuple[Singles, Singles]:
-        """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).
+        """Return the light at points (P, 3): unit directions (P, F, 3), and attenuations (P, F).
 
-        A strength is the inverse square of the distance, relative to the light at the lamp's reference distance, times
-        the share of the lamp's lobe.
+        The attenuation is the inverse square of the distance, relative to the light at the lamp's reference distance,
+        times the lamp's lobe.
         """
         towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
@@ -177,9 +177,9 @@ UNIT_HINT = (
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Warn of lamps that are hardly possible over an object with this mask (H, W), from a file of positions, if any.
+    """Warn of implausible lamps over an object with this mask (H, W), from a file of positions, if any.
 
-    Raises InputError where a lamp would be inside the object, or in front of it.
+    Raises InputError if a lamp would be inside the object or hide it from the camera.
     """
     sizes, middle = lamps.extent(mask)
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
@@ -195,9 +195,9 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
 
 
 def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools) -> list[CaptureWarning]:
-    """Warn that lights count as distant over a mask (H, W), although a file has their positions.
+    """Warn that lights are treated as distant over a mask (H, W), although a file has their positions.
 
-    The lamps of the file are None where their scale is unknown.
+    The lamps of the file are None if their scale is unknown.
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
@@ -235,13 +235,13 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
 LOBES = ("light_lobes.txt",)
-_MOST_NARROW = 100  # the exponent of a lamp that has half of its light 7 degrees off its axis
+_MOST_NARROW = 100  # the exponent of a lamp whose intensity halves 7 degrees off its axis
 
 SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
 
 
 class LitSource(Protocol):
-    """What lamps need to know of an opened capture; see CaptureSource."""
+    """The part of CaptureSource that near lamps depend on."""
 
     @property
     def n_lights(self) -> int: ...
@@ -259,7 +259,7 @@ class LitSource(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class LampOptions:
-    """What the user says about near lamps and the camera. All lengths have the same unit, such as millimetres.
+    """The user's options for near lamps and the camera. All lengths have the same unit, such as millimetres.
 
     Raises:
         UsageError: a number is not above 0, or two options contradict each other.
@@ -303,10 +303,10 @@ NO_LAMP_OPTIONS = LampOptions()
 
 @dataclass(frozen=True, eq=False)
 class LampFiles:
-    """What files and options say of near lamps, before the lights and the images are read."""
+    """Near lamps as given by files and options, before the lights and the images are read."""
 
-    positions: Path | None  # the file of positions, or None where `distance` puts the lamps in the light directions
-    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None where it is unknown
+    positions: Path | None  # the file of positions, or None if `distance` puts the lamps in the light directions
+    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None if it is unknown
     pixel_size: float | None
     object_width: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
@@ -314,7 +314,7 @@ class LampFiles:
     used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
 
     def in_words(self) -> str:
-        """Return the source of the lamps' positions, for people."""
+        """Return a description of the source of the lamps' positions."""
         if not self.used:
             return f"{self.positions} is not used"
         what, width = ("a pixel", self.pixel_size) if self.object_width is None else ("the object", self.object_width)
@@ -346,10 +346,10 @@ class LampFiles:
 
 
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
-    """Return what the capture's folder and the options say of near lamps; None for nothing.
+    """Return the near lamps given by the capture's folder and the options; None without any.
 
     A file of positions in the folder is used, unless the user names a file `lights` of distant lights. Beside such a
-    file, and where nothing tells the scale, positions are found but not used.
+    file, or if the scale is unknown, positions are found but not used.
 
     Raises:
         InputError: a file is wrong, or positions are the only lights and their scale is unknown.
@@ -377,7 +377,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
 def find_camera(folder: Path, lamps: LampFiles | None, options: LampOptions) -> tuple[Doubles | None, tuple[Any, ...]]:
     """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
 
-    Raises InputError where the file is wrong.
+    Raises InputError if the file is wrong.
     """
     folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
     path = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
@@ -407,12 +407,12 @@ def read_camera_matrix(path: Path) -> Doubles:
     if matrix.shape != (3, 3):
         problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
         raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
-    ray_basis(matrix)  # refuses other numbers
+    ray_basis(matrix)  # rejects other numbers
     return matrix
 
 
 def _read_lobes(path: Path, positions: Doubles, frame: LightFrame) -> Doubles:
-    """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
+    """Return the lobes (F, 4) of NearLamps for lamps at positions (F, 3). Raises InputError."""
     hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):

@@ -44,7 +44,7 @@ from splinecli.restoration.images import check_white_level
 from splinecli.restoration.lens_blur import remove_blur, surroundings
 from splinecli.system.files import StrPath
 
-EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
+EQUAL = "equal"  # given instead of a file of intensities: all lights have the same intensity
 
 
 def open_capture(
@@ -70,15 +70,15 @@ def open_capture(
         intensities: a file, or EQUAL.
         radiometry: how stored values become linear light. Where it names no ambient image, one called `ambient` in the
             folder is subtracted.
-        white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
-            is found from the files and their values (see WhiteLevel).
+        white_level: stored value from which an observation is considered saturated, such as 4095 for 12 bits. By
+            default it is found from the files and their values (see WhiteLevel).
         lights_format: whether the rows of a light file of text are vectors or angles.
-        lamps: where near lamps are, and the camera, if no files in the folder say so.
-        find_lights: finds the lights from the images, in place of light files.
+        lamps: positions of near lamps, and the camera, unless files in the folder give them.
+        find_lights: estimates the lights from the images, instead of reading light files.
 
     Raises:
-        InputError: the folder contains no capture (see find_capture_files), a light file is wrong, or the window is not
-            inside the images.
+        InputError: find_capture_files does not recognise the folder, a light file is wrong, or the window is not inside
+            the images.
         UsageError: the white level is not a number above 0, or the object's width is given and a part is read.
     """
     check_white_level(white_level)
@@ -155,7 +155,7 @@ def open_capture(
         camera_matrix=camera_matrix,
         window=window.on(facts[0]),
         find_lights=find_lights,
-        # Left out where they are not given, so that earlier stamps stay valid.
+        # Omitted if they are not given, so that earlier stamps stay valid.
         stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
     )
 
@@ -172,7 +172,7 @@ def read_capture(
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:
-    """Open a capture and read it: see open_capture and CaptureSource.read."""
+    """Open a capture with open_capture and read it with CaptureSource.read."""
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
     )
@@ -230,7 +230,7 @@ def _match_count(
 ) -> tuple[tuple[Path, ...], Doubles | NamedLights]:
     """Return the images that a light file is for, and its lights.
 
-    These are all images, or else those of the usual size, or those whose names differ only in their numbers.
+    These are all images, or else the images of the usual size, or the images whose names differ only in their numbers.
     """
     try:
         return images, read_lights(path, len(images), frame, form)

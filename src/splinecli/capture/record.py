@@ -1,5 +1,5 @@
-"""The record that all steps after reading work on, the same with the values that files store, and lights that are
-found."""
+"""The capture record that all steps after reading use, the same with stored values, and lights estimated from the
+images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIDES_DEG = {
 }
 """Azimuths of the sides of an image: counter-clockwise from the right."""
 
-ESTIMATE = "estimate"  # given in place of a light file: the lights are found from the images
+ESTIMATE = "estimate"  # given instead of a light file: the lights are estimated from the images
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class FoundLights:
 
     directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
     errors_deg: Doubles  # (F,), the expected errors of the directions in degrees
-    intensities: Doubles | None = None  # (F,), with a mean of 1; None where they are known
+    intensities: Doubles | None = None  # (F,), with a mean of 1; None if they are known
 
 
 def azimuth_of(first_light: str) -> float:
@@ -61,7 +61,7 @@ def azimuth_of(first_light: str) -> float:
 
 
 def placeholders(n_lights: int) -> Doubles:
-    """Return directions (F, 3) that mean nothing, in place of those that are found later: any that give normals."""
+    """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are estimated."""
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
@@ -73,7 +73,7 @@ LightFinder = Callable[[Singles, Bools, bool], FoundLights]
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
 COPLANAR_RATIO = 1e-3
-"""Lights (F, 3) count as coplanar if their smallest singular value is below this share of the largest."""
+"""Lights (F, 3) are considered coplanar if their smallest singular value is below this share of the largest."""
 
 _UNIT_TOLERANCE = 1e-3
 _DTYPES = {
@@ -91,7 +91,7 @@ _BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One object under F lights, seen by a fixed camera. It is validated when it is made.
+    """One object under F lights, photographed by a fixed camera. It is validated on construction.
 
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
@@ -101,28 +101,28 @@ class Capture:
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
-        ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
+        ground_truth: (H, W, 3) float32 normals, unit, or zero where the ground truth is unknown; or None.
         warnings: faults that reduce accuracy, and decisions that were made for the user.
         estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
             intensities and the images show that they differ; else None.
         estimated_colours: (F, 3) float64, the colours of the lamps, by which the channels were divided because they
             differ from image to image; else None.
-        restored: (P, F) bool, true where an observation was saturated and an estimate stands in its place; None
-            where no observation was restored.
-        white_level: the stored value from which observations counted as saturated; None for floating-point images
+        restored: (P, F) bool, true where a saturated observation was replaced by an estimate; None if no observation
+            was restored.
+        white_level: the stored value from which observations were considered saturated; None for floating-point images
             and for captures that are not read from images.
-        light_errors_deg: (F,) float64, the expected errors of light_directions where they were found from the images;
+        light_errors_deg: (F,) float64, the expected errors of light_directions if they were estimated from the images;
             else None.
         removed_blur: the standard deviation in pixels of the blur that was removed from the images; None for none.
-        lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
-            image on the object's mean plane. None for distant lights.
+        lamps: the positions of near lamps; light_directions then hold at the origin, the middle of the image on the
+            object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic camera. Near lamps
             have their own.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
-            horizon, there are fewer than three lights or all lie in one plane, the mask is empty, or the numbers of the
-            camera matrix are not those of one.
+            horizon, there are fewer than three lights or all are coplanar, the mask is empty, or the camera matrix is
+            invalid.
         UsageError: the camera matrix is not 3 x 3.
     """
 
@@ -170,8 +170,8 @@ class Capture:
             positions: zero-based positions among this record's lights, not indices in the whole capture.
 
         Raises:
-            UsageError: a position is out of range, comes twice, or there are fewer than three.
-            InputError: the chosen lights lie in one plane.
+            UsageError: a position is out of range or repeated, or there are fewer than three.
+            InputError: the chosen lights are coplanar.
         """
         chosen = list(check_light_indices(positions, self.n_lights))
         return replace(
@@ -250,7 +250,7 @@ class Capture:
 
 
 def in_one_plane(light_directions: Doubles) -> bool:
-    """Return whether lights (F, 3) lie in one plane, so that Capture refuses them."""
+    """Return whether lights (F, 3) are coplanar, so that Capture rejects them."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
     return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
 
@@ -258,7 +258,7 @@ def in_one_plane(light_directions: Doubles) -> bool:
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
     """Return the indices as a tuple of ints, in their order.
 
-    Raises UsageError if an index is not below n_lights or comes twice, or if there are fewer than three.
+    Raises UsageError if an index is repeated or not below n_lights, or if there are fewer than three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):
@@ -278,13 +278,13 @@ def _blocks(rows: Singles) -> Iterator[Singles]:
 
 
 def name_reading(*, as_stored: bool) -> str:
-    """Return how a capture was read, as reports and pixel sets name it; see CaptureSource.read."""
+    """Return how CaptureSource.read read a capture, in the words of reports and pixel sets."""
     return "as stored" if as_stored else "restored"
 
 
 @dataclass(frozen=True, eq=False)
 class StoredCapture:
-    """A capture as its files store it, with what is needed to restore it.
+    """A capture as its files store it, with the data needed to restore it.
 
     `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
     lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
@@ -294,12 +294,12 @@ class StoredCapture:
     capture: Capture  # linear observations, divided by the light intensities that the files give
     saturation: Saturation
     intensities_known: bool  # whether a file, an option or the image format gives the light intensities
-    found_intensities: Doubles | None = None  # (F,), those that were found together with the directions, or None
+    found_intensities: Doubles | None = None  # (F,), estimated together with the directions, or None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
-        """Return the capture under lights that are found from these observations.
+        """Return the capture under lights that are estimated from these observations.
 
-        Raises InputError where the images do not tell the lights, or those that are found cannot give normals.
+        Raises InputError if the images do not determine the lights, or the estimated lights cannot give normals.
         """
         capture = self.capture
         try:
@@ -323,7 +323,7 @@ class StoredCapture:
         return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
     def estimate_intensities(self) -> Doubles | None:
-        """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
+        """Return light intensities (F,) estimated from all pixels; None if they are known or assumed equal."""
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
         return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)

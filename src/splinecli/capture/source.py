@@ -47,8 +47,8 @@ Image = TypeVar("Image")
 BYTES_OF_RESULTS = 52
 """Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
 
-_IMAGES = 2  # images in memory while they are read; see read_ahead
-_IMAGES_OF_MASK = 3  # of which the brightness outside the mask is looked at
+_IMAGES = 2  # images in memory while read_ahead reads them
+_IMAGES_OF_MASK = 3  # images whose brightness outside the mask is checked
 Progress = Callable[[], object]  # called once after each image
 
 
@@ -59,21 +59,21 @@ class CaptureSource:
     files: CaptureFiles
     facts: tuple[ImageFacts, ...]
     light_directions: Doubles  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: Doubles  # (F, 3), RGB; ones where no file gives them
+    light_intensities: Doubles  # (F, 3), RGB; ones if no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
-    white_level: float | None = None  # stored value from which an observation counts as saturated; None to find it
-    automatic_mask: Bools | None = None  # (H, W), made from the images in place of a file; see find_mask
+    white_level: float | None = None  # stored value from which an observation is saturated; None to find it
+    automatic_mask: Bools | None = None  # (H, W), made from the images instead of a file; see find_mask
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
     light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
-    lamps: LampFiles | None = None  # what is known of near lamps, or None
+    lamps: LampFiles | None = None  # the near lamps of files and options, or None
     camera_matrix: Doubles | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
-    # JSON values that change when a file that is read for the capture, or the given white level, does. They are older
-    # than what was read: a file that changed meanwhile has another stamp the next time
+    # JSON values that change when a file that is read for the capture, or the given white level, does. They are taken
+    # before reading, so a file that changed meanwhile has another stamp the next time
     stamp: tuple[Any, ...] = ()
 
     @property
@@ -104,9 +104,9 @@ class CaptureSource:
                 are estimated (see estimate_light_intensities).
 
         Raises:
-            UsageError: an index is out of range, comes twice, or there are fewer than three.
-            InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
-                the lights cannot give normals (see Capture).
+            UsageError: an index is out of range or repeated, or there are fewer than three.
+            InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or Capture
+                rejects the lights.
         """
         stored = self.read_stored(light_indices, progress, as_stored=as_stored)
         return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
@@ -121,8 +121,8 @@ class CaptureSource:
     ) -> StoredCapture:
         """Return the values under the chosen lights and the data needed to restore the saturated ones; see read.
 
-        Unless they are wanted as stored, the blur of the lens is removed (see remove_blur), and colours of lamps that
-        differ are divided out, unless the user says that lamps are equal.
+        Unless `as_stored` is set, the blur of the lens is removed (see remove_blur), and colours of lamps that
+        differ are divided out, unless the user states that lamps are equal.
         """
         everything = tuple(range(self.n_lights))
         indices = everything if light_indices is None else check_light_indices(light_indices, self.n_lights)
@@ -178,7 +178,7 @@ class CaptureSource:
     def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
-        Raises InputError where no object stands out, or an image cannot be read.
+        Raises InputError if no object stands out, or an image cannot be read.
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
@@ -192,7 +192,7 @@ class CaptureSource:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
-        """Return the mask (H, W) of what is read of images of this shape. Raises InputError, also for a huge shape."""
+        """Return the mask (H, W) of the window on images of this shape. Raises InputError, also for a huge shape."""
         if self.automatic_mask is not None:
             return self.automatic_mask
         files = self.files
@@ -224,7 +224,7 @@ class CaptureSource:
         return [mask_inverted(path.name)] if looks_inverted(mask, brightness) else []
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
-        """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
+        """Return the mask (H, W). Raises InputError if the sizes of images differ or the memory is too small."""
         size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
         if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
@@ -237,7 +237,7 @@ class CaptureSource:
     def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
 
-        Raises InputError where a lamp would be inside the object.
+        Raises InputError if a lamp would be inside the object.
         """
         if self.lamps is None:
             return None, []
@@ -258,7 +258,7 @@ class CaptureSource:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
         Of these pixels (P,), the stored values are complete; for the linear ones, see pixel_reader. Raises InputError
-        where an image cannot be read, or does not have the size of the mask.
+        if an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
         pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
@@ -276,8 +276,8 @@ class CaptureSource:
 def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
     """Yield read(item) of each item, in order. While one result is used, a thread reads the next.
 
-    An error is raised when the turn of its item comes. Decoders catch what is printed to file descriptor 2. Where
-    Python's stderr is the same, one item is read after the other, so that no message is lost.
+    An error is raised when its item is due. Decoders capture all output to file descriptor 2. If Python's stderr is the
+    same descriptor, the items are read one after the other, so that no message is lost.
     """
     if len(items) < 2 or not stderr_is_apart():
         yield from map(read, items)
@@ -293,13 +293,13 @@ def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the bytes that `infer` takes for a capture: observations in float32, and images or results."""
+    """Return the memory in bytes that `infer` needs for a capture: float32 observations, and images or results."""
     images = min(_IMAGES, n_lights) * image_bytes(*largest)
     return n_pixels * 4 * n_lights + max(images, n_pixels * BYTES_OF_RESULTS)
 
 
 def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
-    """Raise InputError where a capture takes more memory than there is; see capture_bytes."""
+    """Raise InputError if a capture needs more memory than is available; see capture_bytes."""
     height, width = largest[0][:2]
     check_memory(
         capture_bytes(largest, n_pixels, n_lights),

@@ -1,1 +1,1 @@
-"""What is wrong with a capture: its images, lights and ground truth against each other. Nothing here changes data."""
+"""Find faults of a capture by comparing its images, lights and ground truth. Nothing here changes data."""

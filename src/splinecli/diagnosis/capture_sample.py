@@ -1,4 +1,4 @@
-"""What files or arguments say about a capture's lights, and what its pixels show: what the checks see."""
+"""The input of the checks: a capture's lights, from files or arguments, and a sample of its pixels."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from splinecli.system.files import equal_files, reading
 
 @dataclass(frozen=True, eq=False)
 class CaptureSample:
-    """F images and their lights as the checks see them; what several checks need is found once."""
+    """F images and their lights, the input of the checks; results that several checks need are computed once."""
 
     names: Sequence[str]
     all_directions: Doubles  # (N, 3), all lights of the file, in its order
-    indices: Sequence[int]  # (F,), those of the images
+    indices: Sequence[int]  # (F,), the lights of the images
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
-    intensities_known: bool  # whether they are given, or the user says that they are equal
-    intensities: Doubles | None = None  # (F,), those that are given, by which the observations were divided
-    estimated: Doubles | None = None  # (F,), those that were estimated, by which the sample was not divided
+    intensities_known: bool  # whether they are given, or the user states that they are equal
+    intensities: Doubles | None = None  # (F,), the given ones, by which the observations were divided
+    estimated: Doubles | None = None  # (F,), the estimated ones, by which the sample was not divided
     eight_bit: bool = False  # whether the images have 8 bits
-    lamps: NearLamps | None = None  # all near lamps, over the grid of the sample; None if the lights count as distant
+    lamps: NearLamps | None = None  # all near lamps, over the sample's grid; None if the lights are treated as distant
     has_positions: bool = False  # whether positions of lamps are known
     found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
     linear: bool = True  # whether the values of the images are taken as linear
     truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
-    strict: bool = False  # also warn of what the images do not tell
+    strict: bool = False  # also warn of properties that the images leave undetermined
     copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
     background: float = 0.0  # the share of dark background that was left out of the sample
 
@@ -60,7 +60,7 @@ class CaptureSample:
         truth: Floats | None = None,
         strict: bool = False,
     ) -> CaptureSample:
-        """Return what the files of a capture say about the images with these indices, and their sample and closeup."""
+        """Return the checks' input for the images with these indices, from the capture's files, sample and closeup."""
         (sample, closeup), lamps = samples, source.lamps
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
@@ -97,8 +97,8 @@ class CaptureSample:
     def observations(self) -> Floats:
         """The sample's observations (p, F) as they would be if near lamps were distant.
 
-        The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as
-        the misfit of lights in a wrong order, stays.
+        The surface is assumed to be a plane. The part that a matte surface explains is replaced; the rest, such as the
+        residual of lights in a wrong order, is kept.
         """
         if self.lamps is None:
             return self.sample.observations
@@ -114,9 +114,9 @@ class CaptureSample:
 
     @cached_property
     def evened(self) -> Sample:
-        """The sample, divided by the intensities that fit best where nobody measured them.
+        """The sample, divided by the best-fitting intensities unless they were measured.
 
-        They are not the fault of directions and values.
+        This keeps unequal lamps from looking like a fault of the directions or the values.
         """
         intensities = 1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
         return replace(self.sample, observations=self.observations / intensities)
@@ -130,7 +130,7 @@ class CaptureSample:
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that fits the images best, and its probability; None if nothing can be said."""
+        """The other reading that fits the images best, and its probability; None if the readings cannot be compared."""
         kinds: set[Kind] = {"offset", "intensities"}
         if self.linear:
             kinds.add("curve")
@@ -142,7 +142,7 @@ class CaptureSample:
 
     @cached_property
     def light_check(self) -> LightCheck:
-        """What the images say about their lights; those that are shifted are moved back."""
+        """The result of comparing the images with their lights, after moving shifted images back."""
         return self._check_of_moved(self.shifts) if self.shifts else self._check_as_given
 
     @cached_property
@@ -175,11 +175,11 @@ class CaptureSample:
         together = [shifts[place] for place in sorted(shifts)]
         if not of_shading or self._check_as_given.order is None or self._check_of_moved(together).order is None:
             return together
-        return found  # the lights are in another order, so they say nothing of shading
+        return found  # the lights are in another order, so they cannot predict shading
 
     @cached_property
     def shift_error_deg(self) -> float | None:
-        """The median angle by which shifted images turn the normals; None where too few pixels are left."""
+        """The median angle by which shifted images change the normals; None if too few pixels are left."""
         if self.found:
             return None
         known, values = moved_back(self.evened, self._on_grid(self.shifts))

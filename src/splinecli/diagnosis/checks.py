@@ -26,7 +26,8 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 
 DECISIVE = 0.35
 """Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
-ones, none leaves so little. Intensities are an exception, since on flat objects they explain any order."""
+ones, no reading reduces the residual as much. Intensities are an exception, because on flat objects they explain any
+order."""
 
 
 _FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
@@ -49,7 +50,7 @@ def shifted_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
 def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
     """Warn of an image with the values of a camera of fewer bits than the files of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
-    values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may outshine the others
+    values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may be much brighter
     predicted = fit_robustly(values, np.ones_like(values), lights, _FITS)[0] @ lights.T
     lit = predicted > _LIT
     for place, name in enumerate(seen.names):
@@ -91,7 +92,7 @@ def odd_image(seen: CaptureSample) -> list[CaptureWarning]:
 
 
 def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
-    """Return by how many degrees images turn the normals, against those of the others; None with too few others."""
+    """Return by how many degrees images change the normals found from the others; None with too few others."""
     others = [place for place in range(len(seen.names)) if place not in places]
     if len(others) < 3:
         return None
@@ -108,7 +109,7 @@ def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
 
 def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
-    if spread < 0.1:  # lights that determine normals worse; see light_spread
+    if spread < 0.1:  # see light_spread; such lights determine the normals poorly
         where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
         times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
         text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
@@ -135,7 +136,7 @@ def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
 
 
 def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
-    """Suggest to refine the lights where this makes them fit much better."""
+    """Suggest refining the lights if this makes them fit much better."""
     if seen.has_positions or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None:
         return []
     moved_deg = angle_between_deg(refined.directions, seen.directions)
@@ -159,7 +160,7 @@ def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[Capt
     if reading.kind == "intensities" and seen.intensities is None:
         observations = np.asarray(seen.observations, np.float32)
         if estimate_light_intensities(observations, None, seen.directions) is not None:
-            return []  # `infer` estimates them, and says so
+            return []  # `infer` estimates them, and reports it
     error_deg = seen.readings.error_deg(reading, seen.estimated)
     left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
     if seen.doubt.others:
@@ -218,24 +219,24 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     )
 
 
-REPEATED = frozenset({codes.REPEATED_IMAGES})  # where the lights differ, these contradict any others
+REPEATED = frozenset({codes.REPEATED_IMAGES})  # if the lights differ, these contradict all others
 
 DOUBTED = REPEATED | {
     codes.IMAGES_SHIFTED, codes.IMAGE_INCONSISTENT, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_ILL_CONDITIONED
 }  # fmt: skip
-"""After these warnings, nothing that relies on the lights can be told."""
+"""After these warnings, no check that relies on the lights is reliable."""
 
 READ_OTHERWISE = frozenset({codes.NONLINEARITY_SUSPECTED, codes.NEAR_LIGHTS_SUSPECTED, codes.CONSTANT_LIGHT})
-"""After these warnings, the normals tell nothing of the lights' frame, and the images nothing of their order."""
+"""After these warnings, the normals do not determine the lights' frame, nor the images their order."""
 
 
 @dataclass(frozen=True)
 class Check:
     """A row of CHECKS.
 
-    find: returns warnings of what it sees.
+    find: returns warnings of the faults that it finds.
     unless: earlier warnings after which it is skipped.
-    needs_lights: whether it is skipped where the lights were found from the images.
+    needs_lights: whether it is skipped if the lights were estimated from the images.
     """
 
     find: Callable[[CaptureSample], Iterable[CaptureWarning]]
@@ -302,7 +303,7 @@ def _samples(capture: Capture) -> tuple[Sample, Sample]:
 
 
 def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWarning]]:
-    """Return what images without dark background say about their lights (None if found in them), and warnings."""
+    """Return the light check of images without dark background (None if the lights were estimated), and warnings."""
     (sample, background), (closeup, _) = leave_out_background(seen.sample), leave_out_background(seen.closeup)
     seen = replace(seen, sample=sample, closeup=closeup, background=background)
     warnings: list[CaptureWarning] = []
@@ -313,10 +314,10 @@ def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWa
 
 
 def light_spread(light_directions: Doubles) -> tuple[float, bool]:
-    """Return how well lights (F, 3) determine a normal, and whether they lie in a cone rather than near a plane.
+    """Return how well lights (F, 3) determine a normal, and whether they form a cone rather than a plane.
 
     The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation
-    over it. It is 0 for lights in one plane, 0.58 for lights that are spread over the whole sphere.
+    over it. It is 0 for coplanar lights, 0.58 for lights that are spread over the whole sphere.
     """
     values = np.linalg.svd(light_directions, compute_uv=False) / np.sqrt(len(light_directions))
     return float(values[-1]), bool(values[-2] < 2 * values[-1])

@@ -1,4 +1,4 @@
-"""Tell light directions in a wrong frame or order from right ones, by the images and the normals that they give.
+"""Detect light directions in a wrong frame or order, from the images and the normals that they give.
 
 The thresholds were chosen on captures that splinecli's own renderer made (MERL's measured materials, CyclesPS's
 classes of materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the
@@ -28,11 +28,11 @@ class FrameLimits:
 
     curl_weight: float = 5.0  # of a ratio of curls: its logarithm
     rim_weight: float = 1.0  # of a difference of rims
-    told_apart: float = 0.5  # the smallest difference of advantages that tells two frames apart
-    lowest_curl: float = 0.1  # less is noise; on a cap of a sphere, other frames give little more
+    told_apart: float = 0.5  # the smallest difference of advantages that distinguishes two frames
+    lowest_curl: float = 0.1  # less is noise; on a spherical cap, other frames give little more
     rotated: float = 2.0  # of lights rotated by any angle: it is fitted, so it wins a little by noise
-    rim_from: float = 0.3  # share of steep pixels at the rim; with fewer, the mask's edge is no outline
-    rim_fully: float = 0.6  # from here on, the outline counts fully
+    rim_from: float = 0.3  # share of steep pixels at the rim; with fewer, the mask's edge is not an outline
+    rim_fully: float = 0.6  # from here on, the outline has full weight
 
 
 FRAME = FrameLimits()
@@ -43,8 +43,8 @@ class Candidate:
     """One reading of the light file."""
 
     name: str  # in words, such as "y negated"
-    frame: LightFrame | None  # its frame, relative to the given one. None where it is an order that no frame stands for
-    matrix: Doubles = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
+    frame: LightFrame | None  # its frame, relative to the given one. None for an order that no frame is equivalent to
+    matrix: Doubles = field(compare=False)  # (3, 3) M, where lights @ M' are the lights in this reading
     curl: float  # of the normals; 0 is a surface
     rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
     is_order: bool = False  # whether it is another order of the lights
@@ -54,26 +54,26 @@ class Candidate:
 
 @dataclass(frozen=True)
 class LightCheck:
-    """What the images say about the light directions."""
+    """The result of comparing the light directions with the images."""
 
     candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
     # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
     order: str | None
     # distances between the images and the lights in the given order and in the better one, as shares of the median of
-    # random orders; NaN where there are too few lights
+    # random orders; NaN with too few lights
     given_misfit: float
     order_misfit: float
     # the reading that gives better normals; None if there is none. Its frame is relative to the given one
     best: Candidate | None
-    tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its misfit
-    outline_counts: float  # how much the normals at the mask's edge count, from 0 to 1
-    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no reading
+    tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
+    outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
+    # (F, 3), the lights of the observations in the best reading; None if the given one is the best, or no reading
     # clearly is
     mended: Doubles | None
-    # the median angle by which the given lights turn the normals, if the best reading is right; None if the given is
+    # the median angle by which the given lights change the normals, if the best reading is right; None if the given is
     error_deg: float | None = None
-    shadows_tell: bool = False  # whether cast shadows show that the given lights are not those with x and y negated
-    lacks_shadows: bool = False  # whether they speak against the given lights, but not for others
+    shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
+    lacks_shadows: bool = False  # whether they contradict the given lights, without supporting others
     # an image that contradicts the others, without which all this was found; None if there is none
     odd_image: OddImage | None = None
 
@@ -83,7 +83,7 @@ class LightCheck:
 
     @property
     def unchecked(self) -> list[str]:
-        """What the images do not tell about the lights, in words."""
+        """The properties of the lights that the images leave undetermined, in words."""
         missing = []
         if np.isnan(self.given_misfit):
             missing.append(f"their order (fewer than {ORDER.min_lights} lights, too few lit pixels, or a flat object)")
@@ -109,7 +109,7 @@ def check_lights(
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
 ) -> LightCheck:
-    """Return what observations (P, F) of a mask (H, W) say about their lights.
+    """Compare observations (P, F) of a mask (H, W) with their lights.
 
     Args:
         light_directions: (N, 3), all lights of the capture, in the order of the file.
@@ -141,7 +141,7 @@ def _check_frame_and_order(
     names: Sequence[str],
     factors: Factors | None,
 ) -> LightCheck:
-    """Return what check_lights does, for images that do not contradict each other."""
+    """Return the result of check_lights for images that do not contradict each other."""
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
@@ -156,12 +156,12 @@ def _check_frame_and_order(
     others += [candidate(turn.words, None, turn.matrix, is_order=True, steps=turn.steps) for turn in found.turns]
     others += [candidate(name, None, matrix) for name, matrix in _rotations(normals)]
     judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
-    # Where no order fits, the normals are no evidence.
+    # If no order fits, the normals are not evidence.
     fits = found.order != UNKNOWN_ORDER and bool(np.isfinite(given.curl))
     evidence = _by_shadows(judged, given, ShadowCheck.of(observations, found.lights, normals)) if fits else None
     judged = judged if evidence is None else evidence.judged
     ranked = sorted(judged, key=lambda other: -other.advantage)
-    # Rotations are listed only where they count.
+    # Rotations are listed only if they matter.
     ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= FRAME.rotated]
     order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
@@ -178,7 +178,7 @@ def _check_frame_and_order(
     elif mended is not None:
         turn_deg = median_turn_deg(observations, lights, mended)
     if order is not None and best is not None and best.is_order:
-        order, best = best.name, None  # one of several orders that fit, told by the normals
+        order, best = best.name, None  # one of several orders that fit, chosen by the normals
     check = LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None)
     tie = best is not None and mirror_twin(check, best) is not None
     clear = not tie and not found.misfit > ORDER.mended
@@ -207,12 +207,12 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Doubles]]:
 
 class _ShadowEvidence(NamedTuple):
     judged: list[Candidate]  # with it
-    tell: bool  # whether shadows show that the given lights are not those with x and y negated
+    tell: bool  # whether shadows exclude the given lights with x and y negated
     missing: bool  # whether the given lights lack shadows
 
 
 def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -> _ShadowEvidence:
-    """Return candidates after cast shadows told the given reading and the best other one from their twins."""
+    """Return candidates after cast shadows separated the given reading and the best other one from their twins."""
     shadows, best = check.shadows(given.matrix), max(judged, key=lambda other: other.advantage)
     told = {}
     for one in (given, best):
@@ -237,7 +237,7 @@ def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | Non
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    # Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
+    # Among near equals, a frame is preferred, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
     if better and better[0].advantage > (simple[0].advantage if simple else 0) + FRAME.told_apart:
@@ -257,15 +257,15 @@ def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
 
 
 def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
-    """Return the reading with x and y negated in addition, if the evidence cannot tell it from the best one."""
+    """Return the reading with x and y also negated, if the evidence does not distinguish it from the best one."""
     twin = _negated(check.candidates, best)
     return twin if twin not in (None, check.given) and twin.advantage > best.advantage - FRAME.told_apart else None
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
-    """Return the compared readings of a light file as JSON values; figures that cannot be told are null.
+    """Return the compared readings of a light file as JSON values; undetermined values are null.
 
-    Frames come first, then orders, which are judged by their misfit alone.
+    Frames come first, then orders, which are judged by their residual alone.
     """
     readings = [(each.name, check.order_misfit, each.curl, each.rim, each.advantage) for each in check.candidates]
     readings += [(words, misfit, np.nan, np.nan, np.nan) for words, misfit in check.tried]
@@ -282,8 +282,8 @@ def light_warnings(
 ) -> list[CaptureWarning]:
     """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
 
-    If `strict`, also warn of what the images do not tell, as they do not of most reliefs without an outline. Each
-    warning states the error of the normals.
+    If `strict`, also warn of properties that the images leave undetermined, which is the case for most reliefs without
+    an outline. Each warning states the error of the normals.
     """
     warnings = []
     if check.order is not None:
@@ -299,7 +299,7 @@ def light_warnings(
             " decide which is right. Compare bumps and hollows with the object. If they are exchanged, run again with"
             f" --light-frame {BOTH_NEGATED.after(frame)}."
         )
-        # A bump cannot be told from a hollow. With this error, about a quarter of the normals of a good capture are
+        # A bump looks the same as a hollow. With this error, about a quarter of the normals of a good capture are
         # expected within 5 degrees.
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
     if strict and check.unchecked:
@@ -321,7 +321,7 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
         remedy = "Replace each elevation by 90 degrees minus it."
     elif check.order == HALF_VECTORS:
         remedy = f"Double the angle of each light from the camera axis, as {_WRITES_MENDED} does."
-        if check.order_misfit > ORDER.half_left * check.given_misfit:  # a ring, told by the albedo
+        if check.order_misfit > ORDER.half_left * check.given_misfit:  # a ring, recognised by the albedo
             return (
                 f"{light_file.name} probably contains half vectors, half-way between the lights and the camera axis:"
                 f" under them, steep slopes look brighter. {remedy}"

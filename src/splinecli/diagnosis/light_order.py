@@ -1,14 +1,13 @@
-"""Tell lights in a wrong order from right ones, by how well the images fit them; also rings of a dome that are shifted.
+"""Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are shifted.
 
-Rings of a dome that are shifted or mirrored against the others in the light file. A wrong order or frame of all lights
-is found here and by light_check.py. In a dome, single rings may also begin at another lamp, or run the other
-way round.
+A wrong order or frame of all lights is found here and by light_check.py. In a dome, single rings may also be shifted or
+mirrored against the others in the light file, because they begin at another lamp or run the other way round.
 
 Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
-others, as a stronger lamp would. This tells its right lights from wrong ones far better than known intensities do. On
-flat objects, however, free intensities explain any order.
+others, as a brighter lamp would. For metals, this distinguishes right lights from wrong ones far better than known
+intensities do. On flat objects, however, free intensities explain any order.
 
-The thresholds were chosen on the same captures as those of light_check.py.
+The thresholds were chosen on the same captures as in light_check.py.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,7 +31,7 @@ from splinecli.maths import Bools, Doubles, Floats, Integers
 from splinecli.maths.normals import unit
 
 FEWEST_IN_RING = 4
-_EQUAL = 1e-3  # share of the misfit by which equal readings may differ
+_EQUAL = 1e-3  # share of the residual by which equal readings may differ
 
 _WAYS = {
     "": (1, 1, 1),
@@ -45,11 +44,12 @@ _WAYS = {
 
 
 def mend_rings(factors: Factors, lights: Doubles) -> tuple[str, Doubles, float]:
-    """Return what mends the rings of lights (F, 3), in words (none if they fit), the mended lights and their misfit.
+    """Return corrections of the rings of lights (F, 3), in words (none if they fit), the new lights and their residual.
 
-    Rings are mended one after the other, the best first, as long as the images fit clearly better: from the given file,
-    and, because many wrong rings hide each other, from what each ring alone says of all others. The images show how the
-    rings stand to each other; most of them count as right.
+    Rings are corrected one after the other, the best first, as long as the images fit clearly better. The search starts
+    from the given file and, because many wrong rings hide each other, from the readings that each ring alone predicts
+    for all others. The images determine only how the rings are oriented relative to each other; most are assumed to be
+    right.
     """
     found = [_Mended(lights, float(factors.misfits(lights[None])[0]), [])]
     for rings in find_rings(lights):
@@ -102,7 +102,7 @@ def _descend(
         for row, (ring, reading) in enumerate(places):
             stack[row, rings[ring]] = trials[ring][reading][1]
         misfits = factors.misfits(stack)
-        if misfits.min() > 0.95 * misfit:  # one more ring is mended if at most this share of the misfit is left
+        if misfits.min() > 0.95 * misfit:  # one more ring is corrected if at most this share of the residual is left
             break
         # On a regular ring, several readings are the same. The first ones are the simplest.
         best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
@@ -127,7 +127,7 @@ def find_rings(lights: Doubles) -> Iterator[list[Integers]]:
 def _rounds(lights: Doubles) -> list[Integers]:
     """Return the indices of the lights (F, 3) of each ring, where the azimuth goes once round each ring in the file.
 
-    Rings at nearly the same elevation are told in this way. The list is empty if the azimuth does anything else.
+    This separates rings at nearly the same elevation. The list is empty if the azimuth does anything else.
     """
     steps = np.diff(np.arctan2(lights[:, 1], lights[:, 0]), append=0)
     steps = (steps + np.pi) % (2 * np.pi) - np.pi
@@ -153,7 +153,7 @@ def _readings(given: Doubles) -> Iterator[tuple[str, Doubles]]:
 
 
 def _in_words(mended: Sequence[tuple[Integers, str]]) -> str:
-    """Return words for mended rings, from their lights and their words, such as "with lights 9 to 16 shifted by +1"."""
+    """Return words for corrected rings, from their lights and their words: "with lights 9 to 16 shifted by +1"."""
     parts: dict[str, list[str]] = {}
     for lamps, words in mended:
         parts.setdefault(words, []).append(_numbers(lamps + 1))
@@ -168,21 +168,21 @@ def _numbers(numbers: Integers) -> str:
 
 @dataclass(frozen=True)
 class OrderLimits:
-    """Thresholds of the order of the lights. Misfits are shares of the median misfit of random orders."""
+    """Thresholds of the order of the lights. Residuals are shares of the median residual of random orders."""
 
     min_lights: int = 6  # fewer leave too few equations
-    better: float = 0.6  # the largest share of the given misfit that a better order leaves
+    better: float = 0.6  # the largest share of the given residual that a better order leaves
     better_of_few: float = 0.4  # the same for few lights
     few: int = 8
-    mended: float = 0.35  # the largest misfit of a better order; right lights of most metals have less
-    wrong: float = 0.25  # the smallest misfit of a wrong order
+    mended: float = 0.35  # the largest residual of a better order; right lights of most metals have less
+    wrong: float = 0.25  # the smallest residual of a wrong order
     swapped: float = 0.08  # the same where two lights are exchanged
     for_chance: int = 8  # fewer lights fit in too many random orders; they use known intensities
-    random: float = 0.05  # of the brightness; below it, free intensities tell no order
+    random: float = 0.05  # of the brightness; below it, free intensities do not determine the order
     residual: float = 0.2  # of the factors; with more, and few lights, metals fit like a random order
     of_metal: int = 12  # from here on, metals are judged
     half_left: float = 0.6  # half vectors: doubled angles leave at most this share
-    half_misfit: float = 0.04  # of a misfit above this,
+    half_misfit: float = 0.04  # of a residual above this,
     half_worse: float = 0.05  # and are worse by at most this under any kind of intensities
 
 
@@ -192,7 +192,7 @@ ORDER = OrderLimits()
 UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
 
 ZENITH = "if their elevations count from the camera axis"
-"""The reading of lights whose file has zenith angles in place of elevations, in words."""
+"""The reading of lights whose file has zenith angles instead of elevations, in words."""
 
 HALF_VECTORS = "if they are half vectors, as the normals of a mirror ball at its highlights"
 """The reading of lights half-way between the true ones and the camera axis, in words."""
@@ -215,16 +215,16 @@ class LightOrder:
 
     order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
     lights: Doubles  # (F, 3), in this order
-    intensities: Doubles  # (F,), that fit these lights best, for metals; ones where only known ones tell the order
-    given_misfit: float = np.nan  # as a share of random orders'; NaN where there are too few lights
-    misfit: float = np.nan  # that of this order
-    plausible: bool = True  # whether the lights fit well enough for the normals to tell an outline
-    tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its misfit as a share of random orders'
-    turns: tuple[Turn, ...] = ()  # shifts that fit as well. They turn a regular ring of lights
+    intensities: Doubles  # (F,), that fit these lights best, for metals; ones if only known ones determine the order
+    given_misfit: float = np.nan  # as a share of random orders'; NaN with too few lights
+    misfit: float = np.nan  # the same for this order
+    plausible: bool = True  # whether the lights fit well enough for the normals to show an outline
+    tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its residual as a share of random orders'
+    turns: tuple[Turn, ...] = ()  # shifts that fit as well. They rotate a regular ring of lights
 
 
 class _Reading(NamedTuple):
-    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their misfit."""
+    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their residual."""
 
     words: str | None
     lights: Doubles
@@ -237,7 +237,7 @@ def check_order(
     """Return the order of the chosen lights that fits observations (P, F) best.
 
     Args:
-        factors: of the observations; None where there are too few lit ones.
+        factors: of the observations; None if too few are lit.
         light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
         chosen: (F,) the lights of the observations.
     """
@@ -277,7 +277,7 @@ def check_order(
             tried.append(rings)
             if rings.misfit < min(found.misfit * 0.75, ORDER.mended * usual):
                 found = rings
-    # On glossy plates, intensities that may be any hide an order that fits well under the known ones.
+    # On glossy plates, free intensities hide an order that fits well under the known ones.
     fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
     if found is given and not fits_known and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
@@ -310,7 +310,7 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, d
 
 
 def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Doubles) -> bool:
-    """Return whether the albedo under lights (F, 3) changes with the slope as that under half vectors does."""
+    """Return whether the albedo under lights (F, 3) changes with the slope as it does under half vectors."""
     chosen, values = lit_values(observations, LIT_SHARE, _FITTED_PIXELS)
     lit = shadow_weights(values)
     scaled = [fit_robustly(values, lit, reading, _FITS)[0] for reading in (lights, doubled)]
@@ -337,28 +337,28 @@ def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _
 
 
 def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Doubles) -> bool:
-    """Return whether lights fit no better than those in random orders do, whose misfits are given."""
+    """Return whether lights fit no better than in random orders, whose residuals are given."""
     n_lights = len(given.lights)
     # An order is wrong if more than this share of random orders fits as well.
     by_chance = n_lights >= ORDER.for_chance and (random <= given.misfit).mean() > 0.02
-    # An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no
-    # lights could explain: highlights and shadows.
+    # An order is also wrong above this residual, as a share of random orders', if it is also this many times the
+    # residual that remains under any lights, from highlights and shadows.
     unfit = given.misfit > 0.5 * np.median(random) and given.misfit > 6.0 * factors.residual
     judged = factors.residual < ORDER.residual or n_lights >= ORDER.of_metal
     return judged and bool(by_chance or unfit) and _fits_like_random(observations, factors, given.lights)
 
 
 def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
-    """Return whether lights fit well enough for the normals to tell an outline."""
+    """Return whether lights fit well enough for the normals to show an outline."""
     if not fitted.intensities_known:
         return found.misfit <= 0.35 * usual
     random, misfit = random_misfits(fitted, found.lights), fitted.misfits(found.lights[None])[0]
-    # Above these misfits, under free and under known intensities, normals are not plausible.
+    # Above these residuals, under free and under known intensities, normals are not plausible.
     return bool(misfit <= 0.5 * max(float(np.median(random)), 1e-9))
 
 
 def _free_if_possible(factors: Factors, lights: Doubles) -> tuple[Factors, Doubles]:
-    """Return factors that are compared with lights of any intensities, if these tell orders, and random misfits."""
+    """Return factors to compare with lights of free intensities, if these determine orders, and random residuals."""
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
     few = factors.intensities_known and len(lights) < ORDER.for_chance
@@ -376,7 +376,7 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -
     orders = np.stack((lights, *(rng.permutation(lights) for _ in range(_FITTED_ORDERS))))
     intensities = factors.intensities(orders)
     given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
-    # Lights whose residual is below this share of that in random orders are not said to be in a wrong order.
+    # Lights whose residual is below this share of the residual in random orders are not reported as wrong.
     return given > 0.7 * float(np.median(random))
 
 

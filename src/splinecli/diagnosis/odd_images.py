@@ -1,15 +1,15 @@
 """Images that contradict the others, or are shifted because the camera moved, and a ground truth that does not fit.
 
 One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow fell on it. Each
-image is left out in turn. If what the lights cannot explain nearly vanishes without one of them, and stays without any
-other, this one is odd. So is an image that the factors of rank 3 explain far less well than all others.
+image is left out in turn. If the residual nearly vanishes without one image, and remains without any other, this one is
+odd. So is an image that the factors of rank 3 explain far less well than all others.
 
-The thresholds were chosen on the same captures as those of light_check.py, in which one image was dimmed, exchanged or
-half in shadow, or one light was moved by 40 degrees.
+The thresholds were chosen on the same captures as in light_check.py, after one image was dimmed, exchanged or half in
+shadow, or one light was moved by 40 degrees.
 
 Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see light_fit). So each image
-can be predicted from the others whatever its light, and its fine detail lies where the prediction has it. Where it lies
-elsewhere, the image is shifted: the peak of the normalised cross-correlation tells by how much.
+can be predicted from the others under any light, and its fine detail is where the prediction has it. If it is
+elsewhere, the image is shifted: the peak of the normalised cross-correlation gives the distance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,9 +32,9 @@ from splinecli.maths.normals import angle_between_deg
 class OddImageLimits:
     """Thresholds of the check for a single image that contradicts the others."""
 
-    min_lights: int = 10  # with fewer, a right image may seem odd by chance
+    min_lights: int = 10  # with fewer, a correct image may seem odd by chance
     min_misfit: float = 0.04  # of lights, one of whose images is odd, as a share of the brightness
-    residual: float = 0.2  # of the factors; with more, as on metals, misfits tell nothing
+    residual: float = 0.2  # of the factors; with more, as on metals, residuals of lights are not conclusive
     of_others: float = 0.15  # the same of the other images, for residuals
 
 
@@ -46,8 +46,8 @@ class OddImage:
     """An image that contradicts the others."""
 
     place: int
-    left: float  # what is left without it of the misfit, or of the residual of the factors, as a share of that of all
-    # as a share of what its light would give; None where it is not the fault, or the light's intensity is unknown
+    left: float  # residual of the lights or the factors without it, as a share of the residual of all images
+    # as a share of the predicted brightness; None if it is not the fault, or the light's intensity is unknown
     brightness: float | None = None
 
 
@@ -59,7 +59,7 @@ def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | No
     for compared in (*kinds, factors.with_free_intensities()):
         shares = _shares_left(compared, light_directions)
         first, second = np.argsort(shares)[:2]
-        # Largest misfit without the odd image, and smallest one without any other, as shares of that of all images.
+        # Largest residual without the odd image, and smallest one without any other, as shares of all images' residual.
         alone = shares[first] < 0.35 and shares[second] > 0.75
         if alone and factors.residual < ODD.residual:
             brightness = _brightness(compared, light_directions, int(first))
@@ -67,8 +67,7 @@ def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | No
     residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
     second, first = np.argsort(residuals)[-2:]
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
-    # An odd image's residual is above the first, as a share of its brightness, and this many times that of any
-    # other.
+    # An odd image's residual is above the first, as a share of its brightness, and this many times any other's.
     stands_out = residuals[first] > max(0.25, 2.5 * residuals[second])
     if stands_out and left < ODD.of_others:
         return OddImage(int(first), left / factors.residual)
@@ -76,20 +75,20 @@ def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | No
 
 
 def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
-    """Return the mean square misfits (F,) without each image, as roots of their shares of that of all images."""
+    """Return the root mean square residuals (F,) without each image, as shares of all images' residual."""
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
     if misfit < ODD.min_misfit:
         return np.ones(n_lights)
     without = np.repeat(light_directions[None], n_lights, axis=0)
     diagonal = np.arange(n_lights)
-    without[diagonal, diagonal] = 0  # then all of this image is misfit
+    without[diagonal, diagonal] = 0  # then all of this image is residual
     left = factors.misfits(without) ** 2 - (factors.matrix**2).sum(axis=0)
     return np.asarray(np.sqrt(np.maximum(left, 0) * n_lights / (n_lights - 1)) / misfit)
 
 
 def _brightness(factors: Factors, light_directions: Doubles, place: int) -> float | None:
-    """Return the brightness of an image as a share of what the others predict; None where it is not only scaled."""
+    """Return the brightness of an image as a share of the others' prediction; None if it is not only scaled."""
     if not factors.intensities_known:
         return None
     others = np.delete(np.arange(len(light_directions)), place)
@@ -97,7 +96,7 @@ def _brightness(factors: Factors, light_directions: Doubles, place: int) -> floa
     predicted, found = light_directions[place] @ fit, factors.matrix[:, place]
     brightness = float(found @ predicted / max(predicted @ predicted, 1e-12))
     misfit = np.linalg.norm(found - brightness * predicted) / max(float(np.linalg.norm(found)), 1e-12)
-    # Largest misfit of an odd image, as a share of it, that counts as another brightness of the same image.
+    # Largest residual, as a share of an odd image, at which it is considered the same image at another brightness.
     return brightness if brightness > 0 and misfit < 0.3 else None
 
 
@@ -109,14 +108,14 @@ class ShiftLimits:
     least_images: int = 10  # from fewer, polished metals are predicted so badly that right images are named
     least_pixels: int = 1000  # that must stay in the mask under every shift
     predictors: int = 5  # an image is predicted from three factors of four others or more
-    most_detail: float = 4.0  # in local contrasts: highlights count no more
+    most_detail: float = 4.0  # in local contrasts, which limits the weight of highlights
 
 
 SHIFT = ShiftLimits()
 
 
 class ImageShift(NamedTuple):
-    """An image whose detail lies `right` pixels to the right and `down` below where the other images have it."""
+    """An image whose detail is `right` pixels to the right of, and `down` pixels below, its place in the others."""
 
     place: int
     right: int
@@ -148,7 +147,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
 
 
 def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles]:
-    """Yield for each image of (P, F) what the three strongest factors of the predictors explain of it, (P,)."""
+    """Yield the prediction (P,) of each image of (P, F) by the three strongest factors of the predictors."""
     products = values.T @ values
     for place in range(len(products)):
         others = [other for other in predictors if other != place]  # no image predicts itself
@@ -168,16 +167,16 @@ def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> t
         correlations[SHIFT.largest + down, SHIFT.largest + right],
         correlations[SHIFT.largest, SHIFT.largest],
     )
-    at_edge = max(abs(right), abs(down)) == SHIFT.largest  # the peak may lie beyond
-    # A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of
-    # ten images and more, a polished metal reached 0.44 and 0.17.
+    at_edge = max(abs(right), abs(down)) == SHIFT.largest  # the peak may be beyond
+    # A shift is accepted if detail correlates so well at it, and so much better than without it. In captures without
+    # shifts, of ten images and more, a polished metal reached 0.44 and 0.17.
     if at_edge or peak < 0.2 or peak - unmoved < 0.2:
         return None
     around = correlations[SHIFT.largest + down - 1 :, SHIFT.largest + right - 1 :][:3, :3]
-    # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
+    # The shortest shift that is accepted, in pixels of the sample. A tripod sinks by half a pixel.
     if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
         return None
-    # A camera moves the whole picture. The highlights of a polished relief move here in one way, there in another.
+    # A moved camera shifts the whole picture. The highlights of a polished relief move in different directions.
     for half in _halves(inner):
         of_half = _peak(_correlations(detail, expected, half))
         if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
@@ -208,7 +207,7 @@ def _halves(inner: Singles) -> Iterator[Singles]:
 
 
 def _top(before: float, middle: float, after: float) -> float:
-    """Return where the parabola through three values has its top, from the middle one, which is the largest."""
+    """Return the position of the peak of the parabola through three values, relative to the middle, largest one."""
     return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
 
 
@@ -247,8 +246,8 @@ class TruthLimits:
     angle_deg: float = 20.0  # to the rough normals in another frame; metals reach 30 degrees in the right one
     left: float = 0.5  # another frame leaves at most this share of the angle
     reach: float = 0.15  # the largest shift, as a share of the smaller side of the object
-    shift_left: float = 0.65  # a shift leaves less of the angle, and of what a rotation leaves: on balls they are alike
-    fall_deg: float = 1.5  # and takes so much from it
+    shift_left: float = 0.65  # a shift leaves less of the angle, also after a rotation: on balls they are similar
+    fall_deg: float = 1.5  # and reduces it by so much
     most_pixels: int = 4000  # of each comparison
 
 
@@ -261,7 +260,7 @@ _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) f
 def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
     """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame, or when moved.
 
-    It is that of the whole images: unit normals, or zero where there is none. None gives no warning.
+    It covers the whole images: unit normals, or zero without ground truth. None gives no warning.
     """
     if truth is None:
         return []

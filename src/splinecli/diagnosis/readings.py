@@ -1,13 +1,13 @@
 """Other readings of the images: encoded values, near lamps, unequal intensities, and light that every image has.
 
 Any one of them can be mistaken for another, so all are fitted to the same pixels and compared together. A matte model
-is fitted under each reading, and its residual is taken where the values are stored. The probability of a reading is
+is fitted under each reading, and its residual is computed in stored values. The probability of a reading is
 
     p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
 
-where the cost c is what a reading loses for its additional freedom and for being rare, and k how much the residuals of
-real materials, none of which is matte, are worth. Both were fitted to captures of all classes of materials with and
-without these faults (benchmarks/capture_faults.py --fit).
+where the cost c penalises a reading for its additional freedom and for being rare, and k is the weight of the
+residuals, since no real material is matte. Both were fitted to captures of all classes of materials with and without
+these faults (benchmarks/capture_faults.py --fit).
 """
 
 from collections.abc import Collection, Mapping
@@ -29,12 +29,12 @@ ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
 EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over what a pixel shows at right angles
+OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over the value of a pixel that faces the light
 
 COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
 
-EIGHT_BIT = 0.8  # taken off the cost of a curve where images of 8 bits do not say that they are linear
+EIGHT_BIT = 0.8  # subtracted from the cost of a curve if 8-bit images do not state that they are linear
 
 
 LIKELY = 0.5  # probability from which a reading is named
@@ -69,8 +69,8 @@ class Reading:
 
     kind: Kind
     amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
-    ratio: float  # residual over that of the given reading, on the same observations
-    evidence: float  # logarithm of its probability over that of the given reading
+    ratio: float  # residual over the given reading's, on the same observations
+    evidence: float  # logarithm of its probability over the given reading's
     normals: Doubles  # (p, 3), scaled, at the chosen pixels
     intensities: Doubles  # (F,), mean 1; ones unless they are free
 
@@ -80,7 +80,7 @@ class Doubt(NamedTuple):
 
     reading: Reading
     probability: float  # that any other reading is right
-    others: tuple[Kind, ...]  # kinds of readings that the images hardly tell apart from it
+    others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Readings:
         sample: its observations are as stored, not divided by intensities.
         lights: (F, 3), unit.
         intensities: (F,), those that were measured; None for equal ones.
-        eight_bit: whether the images have 8 bits and do not say that they are linear.
+        eight_bit: whether the images have 8 bits and do not state that they are linear.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Readings:
         )
         # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
         clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
-        # Values at full scale look like a curve. As shadows, they do not count.
+        # Values at full scale look like a curve. Treated as shadows, they are ignored.
         if clipped.sum() > 1e-3 * clipped.size:
             values[clipped] = 0
         values = values.clip(min=0)
@@ -141,14 +141,14 @@ class Readings:
             found.append(unequal)
             if "curve" in kinds:  # unequal lamps may hide a curve
                 curve = self._best_curve(free=True)
-                # The intensities under the curve count, not those that a linear reading needs.
+                # The intensities under the curve matter, not the intensities that a linear reading needs.
                 of_lamps = unequal.evidence + _cost_of_equal(free.intensities) - _cost_of_equal(curve.intensities)
                 evidence = curve.evidence + of_lamps
                 found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
         return found
 
     def likeliest(self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()) -> Doubt | None:
-        """Return the reading of these kinds that fits best, and how likely it is; None if nothing can be said.
+        """Return the reading of these kinds that fits best, and how likely it is; None if they cannot be compared.
 
         Kinds that are `accepted` are part of the given reading.
         """
@@ -170,7 +170,7 @@ class Readings:
         return Doubt(best, sum(shares.values()), tuple(others))
 
     def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
-        """Return the median angle in degrees between the normals of a reading and those of the given one.
+        """Return the median angle in degrees between a reading's normals and the given reading's.
 
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
         """
@@ -189,7 +189,7 @@ class Readings:
         fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the place as the light of near lamps does. An object is round if its normals
+        # On a ball, gloss varies with the position, like the light of near lamps. An object is round if its normals
         # predict this share of the variance of the places; then near lamps cost so much more.
         cost = 1.9 if _roundness(best.normals, places) > 0.85 else 0.0
         # At an end of WIDTHS, the residual may fall beyond.
@@ -217,7 +217,7 @@ class Readings:
 
 
 def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
-    """Return the best of some fits by their amounts, which has this cost beside that of its kind.
+    """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
 
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
     """
@@ -230,8 +230,8 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
     if kind != "intensities" or given.residual < 0.06:
         spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
-        # Spread of the normals (their second largest standard deviation) from which powers count in full, and the
-        # share of them that counts for a plate.
+        # Spread of the normals (their second largest standard deviation) from which powers have full weight, and the
+        # share of the weight for a plate.
         power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
@@ -285,7 +285,7 @@ def _fit(
 
 
 def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Doubles) -> Doubles:
-    """Return the next intensities (F,) from what lights of intensity 1 would give, (p, F)."""
+    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity 1."""
     weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
     power = (weights * equal**2).sum(axis=0)
     found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)

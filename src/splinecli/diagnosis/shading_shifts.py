@@ -1,8 +1,8 @@
-"""Images that are shifted against the others, found by their shading and outline where there is no fine detail.
+"""Images that are shifted against the others, found by their shading and outline on objects without fine detail.
 
-A matte model is fitted to the other images under the given lights. What it leaves of an image is compared with what it
-leaves when the image is moved. The light of the image is free, so a wrong direction or intensity is no shift: on a
-ball, moved shading and a moved lamp differ only near the outline and by the shadow.
+A matte model is fitted to the other images under the given lights. Its residual in an image is compared with its
+residual after the image is moved. The light of the image is free, so a wrong direction or intensity is not mistaken for
+a shift: on a ball, moved shading and a moved lamp differ only near the outline and by the shadow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ class ShadingLimits:
     """Thresholds of shifts that shading shows. Falls and residuals are shares of the image's brightness."""
 
     reach: float = 0.2  # shifts are compared up to this share of the smaller side of the object,
-    counted: float = 0.75  # and count up to this share of it: wrong models often improve on and on
+    counted: float = 0.75  # and accepted up to this share of that reach: wrong models often keep improving
     fall: float = 0.03  # the residual falls by so much,
     left: float = 0.5  # and to this share, in the whole image and most halves of it
     left_of_few: float = 0.35  # with fewer images: gloss on a rendered sphere under eight lights reached 0.4
@@ -30,7 +30,7 @@ class ShadingLimits:
     least_images: int = 8
     many_images: int = 10
     least_pixels: int = 300
-    residual: float = 0.6  # the model says nothing of metals, which leave more
+    residual: float = 0.6  # the model does not apply to metals, which leave more
     kept: float = 0.3  # least share of the pixels that are neither in shadow nor highlights
     overlap: float = 0.5  # share of the largest overlap
 
@@ -38,7 +38,7 @@ class ShadingLimits:
 LIMITS = ShadingLimits()
 
 
-_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and what is added to it
+_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and an offset
 _PASSES, _FITS = 2, 5
 
 Shift = tuple[int, int]  # right, down
@@ -90,7 +90,7 @@ def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Doub
 
 
 class _Compared(NamedTuple):
-    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and what they are made of."""
+    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and their components."""
 
     left: Doubles
     unmoved: Doubles
@@ -131,7 +131,7 @@ class _MatteModel:
         self._covariance = inverse_3x3(tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6)
 
     def _without(self, place: int) -> Doubles:
-        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are wild."""
+        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are implausible."""
         light, weights = self.lights[place], self._weights[:, place]
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
         amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
@@ -140,9 +140,10 @@ class _MatteModel:
         return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 4.0, normals, 0.0)
 
     def _compared(self, place: int) -> _Compared | None:
-        """Return how the model fits an image at all shifts; None if it says nothing of this image.
+        """Return how the model fits an image at all shifts; None if it does not apply to this image.
 
-        Shadows and highlights of the image are left out; what is dark though the model has it lit is not.
+        Shadows and highlights of the image are left out, but not pixels that are dark although the model predicts
+        light.
         """
         normals, image = self._without(place), self.images[place][self.mask]
         predicted, values = np.maximum(normals @ self.lights[place], 0), image / self._top
@@ -167,13 +168,13 @@ class _MatteModel:
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
     def usual_residual(self, places: Sequence[int]) -> float:
-        """Return the residual that a quarter of some images are below, where they are."""
+        """Return the lower quartile of the residuals of some images in their current positions."""
         found = [compared for compared in map(self._compared, places) if compared is not None]
         still = [compared.left[self.reach, self.reach] for compared in found]
         return float(np.quantile(still, 0.25)) if still else np.inf
 
     def find(self, place: int, usual: float) -> tuple[float, Shift]:
-        """Return the shift that leaves least of an image, and by how much less; 0 if it does not count."""
+        """Return the shift with the smallest residual, and the reduction; 0 if it is not accepted."""
         compared = self._compared(place)
         if compared is None:
             return _NO_SHIFT
@@ -231,13 +232,13 @@ class _MatteModel:
 
 
 def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float, usual: float) -> tuple[float, Shift]:
-    """Return by how much the residual falls at the shift that leaves the smallest share of it; residuals are (h, w)."""
+    """Return the fall of the residual at the shift with the smallest remaining share; residuals are (h, w)."""
     reach = len(left) // 2
     around = np.abs(np.arange(-reach, reach + 1))
     near = np.maximum(around[:, None], around) <= LIMITS.counted * reach
     with np.errstate(invalid="ignore"):
-        # The residual of a shifted image is so many times that of the better images, of which a quarter have less.
-        # Where the model fits no image well, as on polished balls, it does not say which is shifted.
+        # The residual of a shifted image is so many times the lower quartile of the images' residuals. If the model
+        # fits no image well, as on polished balls, it does not show which is shifted.
         counts = near & (unmoved - left >= least_fall) & (unmoved <= LIMITS.residual) & (unmoved >= 2.0 * usual)
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]
@@ -261,7 +262,7 @@ def _residual(count: Doubles, products: Doubles, sums: Doubles, squares: Doubles
 
 
 def _moved(image: Doubles | Bools, shift: Shift) -> Doubles:
-    """Return image(x + shift) on the same map; zero where this lies outside."""
+    """Return image(x + shift) on the same map; zero where x + shift is outside."""
     moved = np.zeros(image.shape)
     to, source = (
         tuple(

@@ -1,4 +1,4 @@
-"""Summary of a capture without normals, and a sample of its pixels, small enough for checks that see neighbours."""
+"""Summary of a capture without normals, and a sample of its pixels, small enough for checks that use neighbours."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ from splinecli.errors import InputError
 from splinecli.maths import Bools, Doubles, Floats
 from splinecli.restoration.images import Saturation, WhiteLevel, find_object, find_saturated, white_level_warnings
 
-MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
+MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
 
 
@@ -40,7 +40,7 @@ def grid_of(mask: Bools) -> Part:
 def closeup_of(mask: Bools) -> Part:
     """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W) with pixels."""
     middles = []
-    for axis in (1, 0):  # the median row and column of its pixels, without a list of these, which takes 16 bytes each
+    for axis in (1, 0):  # the median row and column of its pixels, without listing them, which takes 16 bytes each
         up_to = np.cumsum(np.count_nonzero(mask, axis=axis))
         middles.append(int(np.searchsorted(up_to, (up_to[-1] + 1) // 2)))
     row, column = (max(0, middle - CLOSEUP_SIDE // 2) for middle in middles)
@@ -60,7 +60,7 @@ def sample_observations(
 ) -> Sample:
     """Return the sample of a mask (H, W) in a part of the images; None for its grid.
 
-    Observations (P, F) are those of the mask, or of those of its pixels that are `known`: at least those of the part.
+    Observations (P, F) cover the mask, or only its `known` pixels, which include at least the pixels of the part.
     """
     part = part or grid_of(mask)
     chosen = pixels_of([part], mask)
@@ -93,7 +93,7 @@ _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture; only the mask's pixels count."""
+    """One image of a capture; only the mask's pixels are used."""
 
     path: Path
     shape: tuple[int, ...]  # (H, W, C) as stored
@@ -111,7 +111,7 @@ class CaptureSummary:
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
-    # some of the pixels of all images, on a grid, and every pixel of the middle; None where images have different sizes
+    # some of the pixels of all images, on a grid, and every pixel of the middle; None if images have different sizes
     samples: tuple[Sample, Sample] | None
     lamp_warnings: list[CaptureWarning]  # about near lamps over this mask
     mask_warnings: list[CaptureWarning] = field(default_factory=list)
@@ -172,7 +172,7 @@ class CaptureSummary:
 def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
-    Raises InputError where an image cannot be read, is too large or does not fit, or a lamp would be inside the object.
+    Raises InputError if an image cannot be read, is too large or does not fit, or a lamp would be inside the object.
     """
     for facts in source.facts:
         check_stored_size(*facts.size, facts.path)

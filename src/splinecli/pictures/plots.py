@@ -48,7 +48,7 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
 
 
 def png_bytes(figure: Figure, dpi: int) -> bytes:
-    """Return a figure as a PNG file, on white whatever the user's matplotlibrc says."""
+    """Return a figure as a PNG file, on white regardless of the user's matplotlibrc."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no warning.
@@ -74,7 +74,7 @@ def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | Non
     for ring_deg in (*_RINGS_DEG, 90):
         radius = np.sin(np.radians(ring_deg))
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1)
-        if ring_deg < 90:  # the label of 90 degrees would overlap that of 75 degrees
+        if ring_deg < 90:  # the labels of 90 and 75 degrees would overlap
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
     for outline in [] if errors_deg is None else _circles(light_directions, np.radians(errors_deg), angle):
@@ -113,7 +113,7 @@ def observation_map_figure(
 ) -> bytes:
     """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all lights.
 
-    Row 0 of a map is y = +1. The maps of a pixel share one frame, that of the camera or that of the pixel. Values are
+    Row 0 of a map is y = +1. The maps of a pixel share one frame, either the camera's or the pixel's. Values are
     relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the horizon.
 
     Args:
@@ -156,7 +156,7 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
     axes.set_yticks([])
     axes.set_facecolor("0.85")  # light gray, which the colour scale does not contain
     # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
-    # stand for a single line each.
+    # represent a single line each.
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
     if grid == "cnn-ps":
         centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
@@ -169,7 +169,7 @@ Columns = Mapping[str, Sequence[float | None]]
 def training_figure(columns: Columns) -> Figure:
     """Return a matplotlib figure of the loss, the angular errors and the map errors against the step.
 
-    `columns` are those of metrics.csv by name, all of one length; None marks a value that was not computed.
+    `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was not computed.
     """
     from matplotlib.figure import Figure
 
@@ -193,7 +193,7 @@ def training_figure(columns: Columns) -> Figure:
 def _plot(axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1) -> None:
     points = [(step, value) for step, value in zip(columns["step"], columns[name], strict=True) if value is not None]
     if points:
-        style = "o" if len(points) == 1 else style  # one point is no line
+        style = "o" if len(points) == 1 else style  # one point does not make a line
         axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
 
 
@@ -225,12 +225,12 @@ def method_maps(
 ) -> bytes:
     """Return a PNG file with a column for the ground truth and one for each method: normal map above error map.
 
-    Normals have the colours (n + 1) / 2, errors those of colour_errors from 0 to TOP_DEG; other pixels are white. The
-    maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
-    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
+    Normals have the colours (n + 1) / 2, errors the scale of colour_errors from 0 to TOP_DEG; other pixels are white.
+    The maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged,
+    so that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
 
-    The ground truth (H, W, 3) is unit, or zero where there is none; the mask (H, W) is not empty. By method, in the
-    order of the columns, there are normals (H, W, 3) and errors (H, W), NaN where there is no error.
+    The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty. Each method, in the
+    order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels without an error.
     """
     from matplotlib.figure import Figure
 
@@ -270,7 +270,7 @@ def method_maps(
 
 
 def _draw_bar(figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1) -> None:
-    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title to one side of it."""
+    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title on one side."""
     inset = text // 2  # room for half a label at either end
     length, edge = height - 2 * inset, left + text * (side > 0)
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)

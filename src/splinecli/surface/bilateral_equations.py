@@ -8,14 +8,14 @@ camera of focal length f. The normal n of a pixel fixes how h changes towards th
 Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour. Orthographic rays are all
 (0, 0, -1), and f dr is one pixel.
 
-Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to one
-of them. The method therefore weights the squared residual towards each side by
+Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to only one
+neighbour. The method therefore weights the squared residual towards each side by
 
     share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
 
-A side without a neighbour counts as a gap of zero. In the paper, noise and small errors of the normals change the
-shares, too, and the surface tears along rows and columns of pixels where it is continuous. Here a share counts only as
-far as the normal is contradicted, with r the larger residual of the two sides:
+A side without a neighbour is treated as a gap of zero. In the paper, noise and small errors of the normals change the
+shares, too, so that a continuous surface tears along rows and columns of pixels. Here a share deviates from 1/2 only to
+the extent that the surface contradicts the normal, with r the larger residual of the two sides:
 
     1/2 + (share - 1/2) (1 - exp(-(r / CONTRADICTION)^2)).
 """
@@ -35,7 +35,7 @@ from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
-CONTRADICTION = 0.3  # residual that contradicts a normal: that of a frontal one which is off by 17 degrees
+CONTRADICTION = 0.3  # residual that contradicts a normal, such as a frontal one with an error of 17 degrees
 
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
 # the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and
@@ -130,7 +130,7 @@ class LaplacianSolver:
         self._far = np.concatenate([far for _, far in pairs])
         self._n_pixels = n_pixels
         self._preconditioner: Any = None
-        # The matrix always has the same pattern. A matrix of positions says which value goes where.
+        # The matrix always has the same pattern. A matrix of positions records the place of each value.
         pixels = np.arange(n_pixels, dtype=np.int32)
         rows = np.concatenate((self._near, self._far, pixels))
         columns = np.concatenate((self._far, self._near, pixels))
@@ -149,8 +149,8 @@ class LaplacianSolver:
         """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
 
         Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
-        half the second derivative by the height of each pixel, of what pulls it to a known height, and `distance` (P,)
-        that of the heights above these known ones.
+        half the second derivative by the height of each pixel, of the cost that pulls it to a known height, and
+        `distance` (P,) has the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse.linalg import cg

@@ -1,10 +1,10 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
-where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from elsewhere may
-give what is wider than some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and
-normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the linear solver.
-Frame: x right, y up, z to the camera (docs/files-and-frames.md).
+where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from another
+source may give the shape at wavelengths above some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently
+combining positions and normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the
+linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _STILL = 0.002  # pixels: the rms movement at which the surface is finished
 _COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 _SOLVES_OF_COARSEST = 150
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
-_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; float32 keeps no more than whole numbers above
+_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
 _FARTHEST = 3.0  # from the median height to any other, in the larger of the mask's width and height
 
 RELIEF_WIDTH = 64.0
-"""Waves of this width in pixels keep half of their height; the normals' small errors over wider ones do not count."""
+"""The high-pass filter halves the amplitude at this wavelength in pixels; it suppresses errors at longer ones."""
 
 Progress = Callable[[float], object]  # called with the share of the work that was just done
 
@@ -58,10 +58,10 @@ def integrate_normals(
         camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV: columns count to the
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
         discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
-        prior: (H, W), a coarse surface from elsewhere, as a scanner gives it: heights or depths like the result, NaN
-            where it is not known. The result has its shape in the large, its offset and, in depths, its scale.
-        prior_detail: the width in pixels of the waves that come from prior and normals in equal parts. Wider ones
-            follow the prior. None for 15 % of the root of the mask's area.
+        prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths like the result, NaN
+            where it is not known. The result has its large-scale shape, its offset and, for depths, its scale.
+        prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer waves follow the
+            prior. None for 15 % of the root of the mask's area.
         progress: see Progress. The shares may add up to less than 1.
 
     Raises:
@@ -90,9 +90,9 @@ def integrate_normals(
 def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
-    Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
-    unit in the mask, x right, y up, z to the camera, pulled to height zero. Of a wave of k radians per pixel, this is
-    kept: k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
+    Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
+    unit in the mask, x right, y up, z to the camera, pulled to height zero. The filter's gain at k radians per pixel is
+    k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
     return integrate_normals(normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(
@@ -101,7 +101,7 @@ def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
 
 
 class _Surface(NamedTuple):
-    """What is known of a surface: see integrate_normals. The prior is one of heights (P,)."""
+    """The input of integrate_normals for the pixels of a mask. The prior has heights (P,)."""
 
     normal_map: Floats
     mask: Bools
@@ -124,7 +124,7 @@ class _Surface(NamedTuple):
 
 
 def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Doubles:
-    """Return the heights (P,) of the mask's pixels; see integrate_normals.
+    """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
     at the coarsest scale, where many solves take little time. Finer scales follow the edges.
@@ -147,7 +147,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
             return heights
         precision, most = _LATER_PRECISION, min(20, max(4, _SOLVED_PIXELS // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
-    # Normals fix gaps, which are the smaller the wider a wave is. At this width, both weigh the same.
+    # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the same weight.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
     known_heights = 0.0 if prior is None else np.nan_to_num(prior)
     for _ in range(most):
@@ -162,10 +162,10 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
 
 
 def _normals_of(blocks: Blocks, normals: Doubles, mask: Bools, *, keep_edges: bool) -> Doubles:
-    """Return the normals (p, 3) of blocks from those of their pixels (P, 3): of the mean slope, or of the steepest one.
+    """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or the steepest one.
 
     With keep_edges, a block that contains an edge has the steepest normal, which belongs to the rim. The mean over an
-    edge would be a slope that joins what it separates.
+    edge would be a slope that joins the two separate sides.
     """
     slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
     mean = unit(blocks.average(slopes, mask))
@@ -198,7 +198,7 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
 
 
 def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
-    """Raise InputError where some values (P,) of a prior over a mask (H, W) are wrong; `what` says in which way."""
+    """Raise InputError if any values (P,) of a prior over a mask (H, W) are wrong, with the reason in the message."""
     if wrong.any():
         row, column = divmod(int(np.flatnonzero(mask)[wrong.argmax()]), mask.shape[1])
         problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}, the first in row {row}"
@@ -248,7 +248,7 @@ def _depth_map(heights: Doubles, mask: Bools, camera_matrix: Floats | None, prio
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
     offsets = np.bincount(parts, heights) / np.bincount(parts)
-    if prior is not None:  # a part that the prior does not reach has the mean height of what is known
+    if prior is not None:  # a part that the prior does not cover has the mean height of the known pixels
         is_known = np.bincount(parts, np.isfinite(prior)) > 0
         offsets = np.where(is_known, 0, offsets - np.nanmean(prior))
     heights = heights - offsets[parts]

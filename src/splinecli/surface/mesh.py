@@ -6,7 +6,7 @@ camera.
 
 The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser mesh. A viewer
 interpolates the unit normal N and the tangent T of the vertices over a triangle and scales both to unit length. The
-bitangent is B = N x T, which points up in the image. A texel (x, y, z) then stands for the normal x T + y B + z N, and
+bitangent is B = N x T, which points up in the image. A texel (x, y, z) then represents the normal x T + y B + z N, and
 its colour is (x + 1) / 2 and so on (glTF 2.0, section 3.9.3).
 """
 
@@ -29,17 +29,17 @@ class SurfaceMesh:
     """A triangle mesh with the textures of its image."""
 
     vertices: Singles  # (V, 3) float32
-    # (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them
+    # (T, 3) int32, the numbers of three vertices each, counter-clockwise as viewed by the camera
     triangles: NDArray[np.int32]
     normals: Singles  # (V, 3) float32, unit
     # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from 0 at
     # the top to 1 at the bottom, as in glTF
     uvs: Singles
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
-    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
+    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if `normals` are
     # exact.
     normal_texture: NDArray[np.uint8] | None = None
-    tangents: Singles | None = None  # (V, 3) float32, unit, where there is a normal texture
+    tangents: Singles | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
     def colours(self) -> NDArray[np.uint8] | None:
@@ -71,7 +71,7 @@ def surface_mesh(
         mask: (H, W), True on the object.
         camera_matrix: (3, 3), the one that integrate_normals had, or None.
         colours: (H, W, 3) uint8 sRGB, or None.
-        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None for those of the triangles.
+        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them from the triangles.
         largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
             camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
             all triangles.
@@ -172,7 +172,7 @@ def _triangles(heights: Doubles, mask: Bools) -> NDArray[np.int32]:
 
 
 TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
-LARGE_MAP = 500_000  # pixels from which the triangles of a map are so many that those of blocks are decimated
+LARGE_MAP = 500_000  # pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
 _TRIANGLES = 50_000  # at a time
 _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
 _LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
@@ -238,10 +238,10 @@ def _mesh_of_blocks(
     normal_map: Floats,
     largest_step: float | None,
 ) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
+    """Return a mesh of blocks of a large map's pixels; None if they would be too few, or the map is small.
 
-    Collapsing all edges of a large map takes much memory. If far fewer triangles are wanted, those of the blocks, which
-    are at least TRIANGLES_LEFT times as many, have the same shape, and the normal texture keeps the detail.
+    Collapsing all edges of a large map takes much memory. If far fewer triangles are requested, a mesh of the blocks,
+    with at least TRIANGLES_LEFT times as many, has the same shape, and the normal texture keeps the detail.
     """
     step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
     if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
@@ -250,7 +250,7 @@ def _mesh_of_blocks(
     of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
     of_blocks[blocks.mask] = blocks.average(pixels, mask)
-    # Without a camera, a step counts in blocks, as a pixel does.
+    # Without a camera, a step is measured in blocks, like a pixel.
     scale = step if camera_matrix is None else 1
     mesh = surface_mesh(
         of_blocks[..., 0] / scale,
@@ -317,7 +317,7 @@ def _in_frame(measured: Doubles, normals: Doubles, tangents: Doubles) -> Doubles
 def _covered_pixels(
     points: Doubles, triangles: Integers, shape: tuple[int, ...]
 ) -> Iterator[tuple[NDArray[np.intp], Doubles, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield the pixels whose centres lie in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
+    """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
     for start in range(0, len(triangles), _TRIANGLES):
         numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
         corners = points[triangles[numbers]]
@@ -345,7 +345,7 @@ def _barycentric_forms(corners: Doubles) -> Doubles:
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
     area = np.einsum("tcx,tcx->tc", normal, corners - following)
-    area[np.abs(area) < 1e-9] = np.nan  # a triangle that the camera sees from the side covers nothing
+    area[np.abs(area) < 1e-9] = np.nan  # a triangle viewed edge-on covers no pixels
     normal = normal / area[..., None]
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 

@@ -1,4 +1,4 @@
-"""The pixels of a map: their rays through a pinhole camera, and square blocks of them, for coarser scales.
+"""The pixels of a map: their rays through a pinhole camera, and square blocks of pixels, for coarser scales.
 
 A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows count down, and
 (0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of docs/files-and-frames.md: x right, y up,
@@ -23,9 +23,9 @@ _LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of int
 
 
 def pixel_rays(mask: Bools, camera_matrix: Floats) -> Doubles:
-    """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
+    """Return the points (P, 3) at depth 1, z = -1, on the rays from a camera at the origin to pixels of a mask (H, W).
 
-    Raises UsageError if the camera matrix is not 3 x 3, or InputError if the numbers are not those of a camera matrix.
+    Raises UsageError if the camera matrix is not 3 x 3, or InputError if it is not a valid camera matrix.
     """
     rows, columns = np.nonzero(mask)
     return rays_at(rows, columns, camera_matrix)
@@ -38,9 +38,9 @@ def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Doubles:
 
 
 def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None) -> Doubles:
-    """Return the columns and rows (P, 2) at which a camera sees points (P, 3); without a matrix it is orthographic.
+    """Return the columns and rows (P, 2) of the projections of points (P, 3); without a matrix they are orthographic.
 
-    The points are from the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
+    The points are relative to the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
     """
     if camera_matrix is None:
         return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)
@@ -54,7 +54,7 @@ def focal_length(camera_matrix: Floats) -> float:
 
 
 def ray_basis(camera_matrix: Floats) -> Doubles:
-    """Return the rows (3, 3) that turn an image point (column, row, 1) into its ray.
+    """Return the rows (3, 3) that map an image point (column, row, 1) to its ray.
 
     The first row is the step of a ray from one column to the next, the second the step from one row to the next, and
     the third the ray of the image's origin. Raises the errors of pixel_rays.
@@ -79,7 +79,7 @@ def ray_basis(camera_matrix: Floats) -> Doubles:
 class Blocks:
     """The blocks of step x step pixels that contain a pixel of the object."""
 
-    mask: Bools  # (h, w) bool, true for these blocks; p of them
+    mask: Bools  # (h, w) bool, true for these p blocks
     step: int  # pixels along a side of a block
 
     @classmethod
@@ -112,14 +112,14 @@ class Blocks:
         return (sums / np.bincount(block)[:, None]).astype(values.dtype)
 
     def shrink_camera(self, camera_matrix: Floats | None) -> Floats | None:
-        """Return the camera matrix in blocks from that in pixels; None for an orthographic camera."""
+        """Return the camera matrix in blocks from the matrix in pixels; None for an orthographic camera."""
         if camera_matrix is None:
             return None
         shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
         return np.asarray(shrunk @ camera_matrix)
 
     def interpolate(self, depth: Floats, mask: Bools) -> Floats:
-        """Return the depths (P,) of the pixels of a mask (H, W) from those of the blocks (h, w)."""
+        """Return the depths (P,) of the pixels of a mask (H, W) from the depths of the blocks (h, w)."""
         if self.step == 1:
             return depth[mask]
         from scipy.ndimage import map_coordinates
@@ -133,7 +133,7 @@ class Blocks:
         return np.asarray(number[rows // self.step, columns // self.step])
 
     def spread(self, values: Array) -> Array:
-        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells have those of the nearest."""
+        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells copy the nearest block."""
         from scipy.ndimage import distance_transform_edt
 
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)

@@ -1,4 +1,4 @@
-"""Files: what is at a path, and output files that appear complete or not at all."""
+"""Files: queries about paths, and output files that appear complete or not at all."""
 
 import errno
 import filecmp
@@ -68,7 +68,7 @@ def utf8_name(path: Path, file: IO[bytes]) -> str:
 
 def create_hidden(folder: Path) -> IO[bytes]:
     """Return a new hidden file of a random name in the folder, open for writing. Raises OSError."""
-    # Mode x neither opens what is there nor follows a link.
+    # Mode x neither opens an existing file nor follows a link.
     return (folder / f".{secrets.token_hex(8)}{UNFINISHED}").open("xb")
 
 
@@ -87,10 +87,10 @@ def made_folder(folder: Path) -> Iterator[list[Path]]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a new file that takes the place of `path` after the block, so that it appears complete or not at all.
+    """Yield a new file that replaces `path` after the block, so that it appears complete or not at all.
 
-    It is written beside its place and renamed. The rename replaces a link, it does not follow it. Folders are made as
-    needed. Raises OutputError.
+    It is written in the same folder and renamed. The rename replaces a link instead of following it. Folders are made
+    as needed. Raises OutputError.
     """
     temporary: Path | None = None
     with refusals_as_output_errors(path), made_folder(path.parent) as made:
@@ -115,7 +115,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 def sync(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk. Raises OSError."""
     windows = os.name == "nt"
-    if windows and path.is_dir():  # Windows opens no folders
+    if windows and path.is_dir():  # Windows cannot open folders
         return
     handle = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
     try:
@@ -128,7 +128,7 @@ def sync(path: Path) -> None:
 
 
 def sync_names(folder: Path, *made: Path) -> None:
-    """Wait until the names in a folder, and those of folders that were made, are on the disk. Raises OSError."""
+    """Wait until the names in a folder and in newly made folders are on the disk. Raises OSError."""
     for place in dict.fromkeys((folder, *(new.parent for new in made))):
         sync(place)
 
@@ -142,12 +142,12 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def is_special(path: Path) -> bool:
-    """Return whether there is something else than a file, such as a folder, a pipe or a device. It might never end."""
+    """Return whether the path is something other than a file: a folder, a pipe or a device, which might never end."""
     return path.exists() and not path.is_file()
 
 
 def read_json(path: Path) -> Any:
-    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and for what is no file."""
+    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it is not a file."""
     if is_special(path):
         raise ValueError("it is no file")
     if path.stat().st_size > _MOST_JSON:
@@ -170,7 +170,7 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError inside the context into an OutputError that names the path."""
+    """Convert an OSError inside the context to an OutputError that names the path."""
     try:
         yield
     except OSError as error:
@@ -181,9 +181,9 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
 
 
 def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
-    """Return what a system's refusal outside of refusals_as_output_errors means: that a file cannot be read.
+    """Return our error for an OSError outside refusals_as_output_errors: usually, that a file cannot be read.
 
-    `path` is named where the error names none.
+    `path` is named if the error does not name a file.
     """
     if error.errno in _NO_ROOM:
         return NoRoomError(f"cannot be written ({error.strerror})", path=error.filename or path)
@@ -231,7 +231,7 @@ StrPath = str | os.PathLike[str]  # a path in any form that the standard library
 
 
 def find_mode(path: Path) -> int | None:
-    """Return the mode (see stat) of what is at the path, following links; None for nothing. Raises InputError."""
+    """Return the mode (see stat) of the path, following links; None if it does not exist. Raises InputError."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -245,7 +245,7 @@ def find_mode(path: Path) -> int | None:
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
 
-    With `pipe`, the shell's process substitution `<(...)` may stand in its place, see is_substitution.
+    With `pipe`, the shell's process substitution `<(...)` is accepted as well, see is_substitution.
     """
     mode = find_mode(path)
     if mode is None:
@@ -256,7 +256,7 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
 
 @contextmanager
 def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """Turn an error of the system while a file is read into an InputError that names it."""
+    """Convert a system error while a file is read to an InputError that names it."""
     try:
         yield
     except OSError as error:
@@ -266,7 +266,7 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
 def is_found_file(path: Path) -> bool:
     """Return whether an entry of a folder, with the name of a file that is read, is a file; False for a folder.
 
-    Raises InputError for anything else, such as a pipe or a broken link. To pass over it would hide that.
+    Raises InputError for anything else, such as a pipe or a broken link. Skipping it would hide the problem.
     """
     if is_folder(path):
         return False
@@ -288,7 +288,7 @@ def is_folder(path: Path) -> bool:
 
 
 def resolve(path: Path) -> Path:
-    """Return the path without links and "..". Raises InputError where the system refuses to answer."""
+    """Return the path without links and "..". Raises InputError if the system refuses to answer."""
     try:
         return path.resolve()
     except RuntimeError:  # for a loop of links, before Python 3.13

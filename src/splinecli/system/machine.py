@@ -43,7 +43,7 @@ def import_extra(
     """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
 
     Raises UsageError or `error` if the module is not installed. The message names the command that installs it, the
-    file at `path` that cannot be read without it, and `otherwise`, another way out.
+    file at `path` that cannot be read without it, and `otherwise`, an alternative.
     """
     try:
         return importlib.import_module(module)
@@ -66,7 +66,7 @@ _GROUP_FILES = (  # the limit, the use, and the file cache within it
 
 
 def available_memory() -> float:
-    """Return the bytes of memory that this process may still use; infinity where the system does not say.
+    """Return the bytes of memory that this process may still use; infinity if the system does not report it.
 
     It is the least of the machine's free memory, the limits of the process's control groups, and the limit on its
     address space (ulimit -v).
@@ -89,7 +89,7 @@ def own_groups(controller: str) -> Iterator[Path]:
         if not top.is_dir():
             top = _MOUNT / controller
         folder = top / group.lstrip("/")
-        # Inside a container the path may be that of the host, which does not exist here. The top always does.
+        # Inside a container the path may be the host's, which does not exist here. The top always exists.
         for place in (folder, *folder.parents):
             yield place
             if place == top:
@@ -111,7 +111,7 @@ def check_address_space() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep freed blocks for the next arrays, where it is glibc.
+    """Let the C library keep freed blocks for the next arrays, if it is glibc.
 
     By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
     third of the time of networks and of reading. Blocks above _LARGEST_KEPT are still returned.
@@ -122,12 +122,12 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Return freed blocks to the system between two stages, where the C library is glibc; see keep_freed_memory."""
+    """Return freed blocks to the system between two stages, if the C library is glibc; see keep_freed_memory."""
     _of_c_library("malloc_trim")(0)
 
 
 def _of_c_library(name: str) -> Callable[..., object]:
-    """Return a function of the C library, or one that does nothing where there is none of this name."""
+    """Return a function of the C library, or one that does nothing if the library lacks this name."""
     try:
         import ctypes
 
@@ -142,7 +142,7 @@ def _free_memory() -> float:
 
 
 def _left_in_group(folder: Path) -> float:
-    """Return what the limit of a control group leaves. The group's file cache can be freed.
+    """Return the bytes left under the limit of a control group. The group's file cache can be freed.
 
     Without a limit it is infinity or, in version 1, a huge number.
     """
@@ -177,7 +177,7 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that there is no memory left, in Python, PyTorch or the loading of a library."""
+    """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a library."""
     text = str(error).lower()
     return isinstance(error, MemoryError) or (
         isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
@@ -201,7 +201,7 @@ def choose_device(name: Device | str) -> torch.device:
 
 
 def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
-    """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
+    """Return the number format of this name; "auto" is bfloat16 if the device supports it natively."""
     if name != "auto":
         return name
     import torch
@@ -217,9 +217,9 @@ def choose_precision(name: Precision, device: torch.device) -> Literal["float32"
 def use_available_cores() -> None:
     """Limit PyTorch's threads to the cores that this process may use.
 
-    Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
-    may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
-    ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
+    Call it once before a long computation. PyTorch starts one thread per core of the machine, even if a container may
+    use fewer cores. The threads then share the cores, and each step waits for the slowest. The number is only ever
+    lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
     """
     import torch
 
@@ -244,7 +244,7 @@ def cgroup_quotas() -> list[float]:
     quotas = []
     for folder in own_groups("cpu"):
         # Quota and period in microseconds: in one file of version 2, or in two of version 1. The first is "max" or -1
-        # where there is none.
+        # without a quota.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
                 quota, period = " ".join((folder / name).read_text("utf-8") for name in names).split()
@@ -262,8 +262,8 @@ _lock, _users, _threads = Lock(), 0, 0
 def one_thread_each() -> Iterator[int]:
     """Let each operation of PyTorch use one thread only. Yields the number of threads that it used before.
 
-    Operations on small arrays are hardly faster on more, and on a busy machine many times as slow, because all threads
-    of an operation wait for the slowest.
+    More threads hardly speed up operations on small arrays, and on a busy machine make them many times slower, because
+    all threads of an operation wait for the slowest.
     """
     import torch
 
@@ -288,7 +288,7 @@ def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> I
     """Yield function(part) of each part, in order, computed without gradients on as many threads as PyTorch uses.
 
     Within the function, each operation of PyTorch uses one thread. At most one result more than there are threads is
-    kept. An error is raised when the turn of its part comes.
+    kept. An error is raised when its part is due.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""What a long computation reports: pixels that are done, messages, stages and their seconds."""
+"""Reports of a long computation: finished pixels, messages, stages and their seconds."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ from typing import Protocol
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
 
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
-"""The stages, in their order, but for page.html: it is one of the pictures, and comes after the surface."""
+"""The stages in order, except for page.html, which is one of the pictures but is written after the surface."""
 
 
 class Clock:
@@ -41,7 +41,7 @@ class Advance(Protocol):
 class Observer:
     """Receives messages, warnings and progress. This base class ignores them all.
 
-    A subclass overrides what it wants to show.
+    A subclass overrides the methods for anything it shows.
     """
 
     def say(self, message: str) -> None:
@@ -57,7 +57,7 @@ class Observer:
     def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
         """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps.
 
-        `unit` is what the steps are, such as pixels, where their number in a second tells something.
+        `unit` is the name of a step, such as pixels, if the number per second is informative.
         """
         yield lambda amount, note="": None
 

@@ -2,8 +2,8 @@
 
 Each new file is written under a random hidden name and synced. When all are complete, the earlier report is removed,
 then the earlier files, the new ones are renamed to their places, and the new report comes last. So a folder with a
-report is whole. One without is unfinished, and its work is done again. Nothing in a folder tells a later process to do
-anything, and no link in it is followed.
+report is complete. A folder without one is unfinished, and its work is repeated. A later process never acts on
+instructions in a folder, and never follows a link in it.
 """
 
 import importlib
@@ -54,7 +54,7 @@ def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        # Windows removes no file that is open. Elsewhere, whoever locks the file after it is removed sees that.
+        # Windows does not remove an open file. On other systems, a process that locks a removed file detects this.
         if os.name == "nt":
             file.close()
         with suppress(OSError):
@@ -96,7 +96,7 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
 
 
 def _open_lock(path: Path) -> IO[str]:
-    """Open a lock file, which is made as needed. Raises OutputError where there is something else, such as a pipe."""
+    """Open a lock file, which is made as needed. Raises OutputError if it is not a file, but for example a pipe."""
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
     refused = OutputError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
@@ -115,7 +115,7 @@ def _open_lock(path: Path) -> IO[str]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock an open file, unless another process has locked it. Raises OSError where there are no locks."""
+    """Lock an open file, unless another process has locked it. Raises OSError if locks are not supported."""
     try:
         import fcntl
     except ImportError:
@@ -133,7 +133,7 @@ def _try_lock(file: IO[str]) -> bool:
 
 
 def _is_current(file: IO[str], path: Path) -> bool:
-    """Return whether an open file is still the one at the path: its last owner removes it, and others make it anew."""
+    """Return whether an open file is still the one at the path: its last owner removes it, and others recreate it."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
@@ -150,7 +150,7 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
     """Make a folder, lock it, and remove the unfinished files that killed processes left directly in it.
 
     A folder that was made here and is empty at the end is removed, as are its parents. `warn` receives a sentence about
-    what a killed process had left. Raises BusyError if another process has locked the folder, unless it waits for that,
+    the files of a killed process. Raises BusyError if another process has locked the folder, unless it waits for that,
     or OutputError if the folder cannot be made or written.
     """
     check_writable(folder)
@@ -167,7 +167,7 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
                     with locked_file(path):
                         left.append(path)
                 except BusyError:
-                    pass  # the probe of another batch that runs
+                    pass  # the probe of another running batch
                 except OutputError:  # another user's, which may be removed but not opened
                     path.unlink()
                     left.append(path)
@@ -189,9 +189,9 @@ class NewFiles:
         return {name: path.stat().st_size for name, path in sorted(self.hidden.items())}
 
     def write(self, name: str, content: Content) -> None:
-        """Write a new file. Its name may be that of a file in a subfolder. Raises OutputError.
+        """Write a new file. Its name may include a subfolder. Raises OutputError.
 
-        An array becomes NPY, text UTF-8 with escapes for what is not valid.
+        An array is written as NPY, text as UTF-8 with escapes for invalid characters.
         """
         _check_place(self._folder / name, self._folder)
         with refusals_as_output_errors(self._folder / name):
@@ -229,8 +229,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
     Args:
-        report: the name of the file that describes the others: removed first, written last. None where the caller takes
-            care that no report names a file that changes.
+        report: the name of the file that describes the others: removed first, written last. None if the caller ensures
+            that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
     """
     new = NewFiles(folder)
@@ -244,18 +244,18 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 
 
 def refuse_link(folder: Path) -> None:
-    """Raise OutputError if a link stands in the place of a folder: it may lead anywhere."""
+    """Raise OutputError if a folder is really a link, which may lead anywhere."""
     if folder.is_symlink():
         raise OutputError("found a link, expected a folder", path=folder, hint="Remove it, or choose another -o")
 
 
 def is_plain(path: Path) -> bool:
-    """Return whether there is a file, and no link to one."""
+    """Return whether the path is a file, and not a link to one."""
     return path.is_file() and not path.is_symlink()
 
 
 def _check_place(path: Path, folder: Path) -> None:
-    """Raise OutputError if no file can be renamed to a path in a folder or in a subfolder of it."""
+    """Raise OutputError if no file can be renamed to a path in a folder or its subfolders."""
     if path.is_dir() and not path.is_symlink():
         raise OutputError("found a folder, expected a file", path=path)
     if path.parent == folder:

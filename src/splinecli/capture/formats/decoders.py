@@ -1,4 +1,4 @@
-"""Decoders of TIFF and of camera RAW files, and what all decoders raise for damaged ones."""
+"""Decoders of TIFF and of camera RAW files, and the errors that all decoders raise for damaged ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DAMAGED, COPY_AGAIN = "the image is damaged and cannot be read", "Copy or export
 
 @contextmanager
 def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> Iterator[None]:
-    """Turn whatever a reader raises for a damaged file, one of a dozen types, into an InputError."""
+    """Convert any exception that a reader raises for a damaged file, one of a dozen types, to an InputError."""
     try:
         yield
     except SplinecliError:
@@ -52,10 +52,10 @@ _STDERR_LOCK = threading.Lock()
 
 @contextmanager
 def native_stderr() -> Iterator[list[str]]:
-    """Catch what C libraries print to stderr; after the block, the list contains it.
+    """Capture the messages that C libraries print to stderr; after the block, the list contains them.
 
     This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
-    around decoding. What other threads print meanwhile is lost, unless they print elsewhere: see stderr_is_apart.
+    around decoding. Output of other threads is lost meanwhile, unless it goes elsewhere (stderr_is_apart).
     """
     messages: list[str] = []
     with _STDERR_LOCK, tempfile.TemporaryFile() as store:
@@ -63,7 +63,7 @@ def native_stderr() -> Iterator[list[str]]:
             if sys.stderr is not None:
                 sys.stderr.flush()
             original = os.dup(2)
-        except (OSError, ValueError):  # there is no stderr to protect
+        except (OSError, ValueError):  # without a stderr, nothing needs protection
             yield messages
             return
         try:
@@ -141,11 +141,11 @@ def pages(path: Path) -> list[Path]:
 
 @contextmanager
 def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
-    """Yield the first page of an open TIFF file, or that which the path names. Raises InputError for a damaged file."""
+    """Yield the first page of an open TIFF file, or the page in the path. Raises InputError for a damaged file."""
     import tifffile
 
     logger = logging.getLogger("tifffile")
-    before, logger.disabled = logger.disabled, True  # the error says what a user needs
+    before, logger.disabled = logger.disabled, True  # our error says all that a user needs
     try:
         with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
             number = page_of(path)[1]
@@ -177,7 +177,7 @@ def _check_tags(file: BinaryIO, number: int) -> None:
 
 
 def _decode_page(page: Any) -> Array | None:
-    """Return pixels (H, W) or (H, W, samples); None where tifffile has no decoder or fails."""
+    """Return pixels (H, W) or (H, W, samples); None if tifffile has no decoder or fails."""
     if int(page.photometric) == _YCBCR:
         return None
     try:
@@ -192,7 +192,7 @@ def _decode_page(page: Any) -> Array | None:
 
 
 def _check_complete(page: Any, size: int, path: Path) -> None:
-    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels."""
+    """Raise an error if a part of the pixels is beyond the file's size in bytes, or is longer than its pixels."""
     # Such a part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture.
     expanded = math.prod(page.chunks) * page.dtype.itemsize
     longest = 2 * expanded + _LONGEST_EMPTY_PART
@@ -207,7 +207,7 @@ RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
 )  # fmt: skip
-"""RAW files count by their names, because the content of many looks like TIFF."""
+"""RAW files are recognised by their names, because the content of many looks like TIFF."""
 
 
 def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
@@ -226,7 +226,7 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
     """
     with _libraw(path) as rawpy:
-        with native_stderr():  # not longer, because it stops progress bars, too
+        with native_stderr():  # kept short, because it also blocks progress bars
             raw = rawpy.imread(io.BytesIO(content))
             raw.unpack()
         with raw:
@@ -240,8 +240,8 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
                 user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # Others interpolate differently under each light: normals of textured objects have two to three
-                # times the error (AHD 1.4 degrees, LINEAR 0.5), those of uniform objects half of it (0.2, 0.4).
+                # Others interpolate differently under each light: normals of textured objects have two to three times
+                # the error (AHD 1.4 degrees, LINEAR 0.5), but uniform objects have half the error (0.2, 0.4).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     # Some sensors have four colours. The fourth must not become an alpha channel.
@@ -258,7 +258,7 @@ def read_shot(path: Path) -> tuple[float, float, float]:
 
 
 def _full_scale(raw: rawpy.RawPy) -> int:
-    """Return the value above black from which a photosite counts as saturated."""
+    """Return the value above black from which a photosite is considered saturated."""
     white = raw.white_level
     # LibRaw gives the largest number. Many sensors saturate below it, and some files state the level. A level far from
     # the largest number is in another unit.
@@ -272,7 +272,7 @@ def _full_scale(raw: rawpy.RawPy) -> int:
 
 @contextmanager
 def _libraw(path: Path) -> Iterator[ModuleType]:
-    """Yield rawpy. What it raises for a damaged file becomes an InputError."""
+    """Yield rawpy, and convert its errors for a damaged file to an InputError."""
     otherwise = "export the photographs as 16-bit linear TIFF"
     rawpy = import_extra("rawpy", "raw", error=InputError, path=path, otherwise=otherwise)
     try:

@@ -1,6 +1,6 @@
-"""The facts of an image file, found in its header by one look: size, transfer curve, white level and EXIF tags.
+"""The facts of an image file, read from its header in one pass: size, transfer curve, white level and EXIF tags.
 
-The parts before the pixels are walked here, with bounds, because Pillow reads hostile ones without end. Pillow reads
+The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones without end. Pillow reads
 the EXIF tags, and tifffile the tags of TIFF.
 """
 
@@ -60,41 +60,41 @@ _RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 
 @dataclass(frozen=True)
 class StatedCurve:
-    """What a file says of its transfer curve."""
+    """The transfer curve that a file states."""
 
-    curve: TransferCurve = 1.0  # see TransferCurve; linear where the file says nothing
-    by: str = ""  # what says so, for people; empty for nothing
+    curve: TransferCurve = 1.0  # see TransferCurve; linear if the file states none
+    by: str = ""  # the source of the curve, for messages; empty for none
     unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
 _FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
 _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: _ENCODED}
-"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which goes before all else."""
+"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over all others."""
 
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the header of an image file states."""
+    """The facts in the header of an image file."""
 
     path: Path
     kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
-    curve: StatedCurve = StatedCurve()  # that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
-    # the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is in the unit of
-    # the decoded values: full scale for a RAW file, whatever its tags say
+    curve: StatedCurve = StatedCurve()  # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    # the white level of a 16-bit image, 2^bits - 1 if the file states bits; None without one. It is in the unit of
+    # the decoded values: full scale for a RAW file, regardless of its tags
     white_level: int | None = None
     # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
+    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is requested
 
     @property
     def stated_channels(self) -> int | None:
-        """The number of channels, with alpha; None where the header states none."""
+        """The number of channels, with alpha; None if the header states none."""
         return None if self.stated_size is None else (*self.stated_size[0], 1)[2]
 
     @cached_property
     def size(self) -> StoredSize:
-        """The size as stored. Raises InputError for a damaged file. Opening a RAW file takes long."""
+        """The size as stored. Raises InputError for a damaged file. Opening a RAW file is slow."""
         if self.damage is not None:
             raise self.damage
         if self.kind == "RAW":
@@ -123,7 +123,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         file.seek(0)
         if not start:
             raise InputError("the file is empty", path=path)
-        otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
+        otherwise = "TGA" if suffix == ".tga" else None  # TGA files have no signature
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
             found = _BRANDS.get(start[8:], found)
@@ -229,7 +229,7 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
             number = file.read(2)[:1]
             parts[number] = file.read(length - 14)
     profile = None
-    if parts:  # b"" counts as one that cannot be read
+    if parts:  # b"" is treated as an unreadable one
         short = sum(map(len, parts.values())) <= LARGEST_PROFILE
         profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
     curve = _curve(StatedCurve(SRGB, "JPEG"), profile)
@@ -284,7 +284,7 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
 
 
 def _one_value(tag: object) -> int | None:
-    """Return the tag's value where it is one whole number, or the same one for each channel."""
+    """Return the tag's value if it is one whole number, or the same number for each channel."""
     first, *others = tag if isinstance(tag, tuple) and tag else (tag,)
     return first if isinstance(first, int) and all(other == first for other in others) else None
 
@@ -294,7 +294,7 @@ def _level(bits: int) -> int | None:
 
 
 def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
-    """Return the curve of a profile; what else the file states where it has none, or none that can be read."""
+    """Return the curve of a profile, or the otherwise stated curve if the profile is missing or unreadable."""
     if profile is None:
         return stated
     found = profile_curve(profile)
@@ -325,7 +325,7 @@ def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
 
 
 UPRIGHT = 1  # orientation of images that are shown as they are stored
-_SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
+_SAME = 0.1  # share within which two exposures are considered equal: shutters and ISO numbers are rounded
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 
 
@@ -347,7 +347,7 @@ class Exposure(NamedTuple):
 
 
 def find_exposure(facts: ImageFacts) -> Exposure | None:
-    """Return the exposure of an image; None where a part of it is missing or the file is damaged."""
+    """Return the exposure of an image; None if a part of it is missing or the file is damaged."""
     try:
         if facts.exif is None and facts.kind == "RAW":
             numbers: tuple[Any, ...] = read_shot(facts.path)
@@ -361,7 +361,7 @@ def find_exposure(facts: ImageFacts) -> Exposure | None:
 
 
 def check_exposures(images: Sequence[ImageFacts]) -> None:
-    """Raise InputError where two images state different exposures."""
+    """Raise InputError if two images state different exposures."""
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
         first, expected = found[0]
@@ -395,10 +395,10 @@ def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | 
 
 
 def common_orientation(images: Sequence[ImageFacts]) -> int:
-    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT where they state none.
+    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT if they state none.
 
-    RAW files are not asked: their pixels are read as the sensor has them. Raises InputError for two images with
-    different ones, whose pixels do not fit on each other.
+    The orientation of RAW files is ignored: their pixels are read in the sensor's orientation. Raises InputError for
+    two images with different orientations, because their pixels do not correspond.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)

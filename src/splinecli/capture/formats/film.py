@@ -1,6 +1,6 @@
 """Films as captures: a fixed camera films an object while a lamp is carried around it.
 
-Of hundreds of frames, few are needed: sharp ones, not overexposed, whose light differs as much as possible.
+Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as different as possible.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ FILM_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
 
 LEAST_DIFFERENCE = 0.05
-"""Distance between two frames' thumbnails of unit length below which their light counts as the same."""
+"""Distance between two frames' thumbnails of unit length below which their light is considered the same."""
 
-_CANDIDATES = 1000  # frames that are compared; of a longer film, one of two, of four and so on
+_CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
 _THUMBNAIL, _SMALL = 64, 512  # longest sides in pixels: of shading, of sharpness and exposure
 _NEIGHBOURS = 7  # frames before and after, whose light is similar
 _LEAST_READ = 0.8  # share of the frames that the film states
 _BLURRED = 0.6  # share of the neighbours' sharpness
 _DARK = 0.2  # share of the usual brightness
-_CLIPPED = 250  # stored value from which a pixel counts as overexposed
+_CLIPPED = 250  # stored value from which a pixel is overexposed
 _MOST_CLIPPED = 0.01  # share of pixels that are overexposed
 # FFmpeg recognises playlists by their content, and these name other files. So only containers of films are opened.
 _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
@@ -49,18 +49,18 @@ _Candidate = tuple[int, Singles, float, float]
 
 
 def is_film(path: Path) -> bool:
-    """Return whether the path has the name of a film, and is no folder."""
+    """Return whether the path has the name of a film, and is not a folder."""
     return path.suffix.lower() in FILM_SUFFIXES and path.stem.strip(".") != "" and not is_folder(path)
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
     """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights differ most.
 
-    Raises InputError where the film cannot be read, or its light does not move.
+    Raises InputError if the film cannot be read, or its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
-    # Under another light, sharpness is another: only the frames around are compared.
+    # Sharpness depends on the light, so only neighbouring frames are compared.
     near = (slice(max(0, place - _NEIGHBOURS), place + _NEIGHBOURS + 1) for place in range(len(sharpness)))
     around = [np.median(sharpness[frames]) for frames in near]
     usable = (
@@ -85,7 +85,7 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
     with _opened(film) as video:
         place = 0
         for number in numbers:
-            with native_stderr():  # not longer, because it stops progress bars, too
+            with native_stderr():  # kept short, because it also blocks progress bars
                 while place <= number and video.grab():
                     place += 1
                 if place <= number:
@@ -95,7 +95,7 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
 
 
 def _candidates(film: Path) -> list[_Candidate]:
-    """Return frames at even distances, with what their choice depends on. Raises InputError."""
+    """Return evenly spaced frames, with the measurements for choosing among them. Raises InputError."""
     import cv2
 
     found: list[_Candidate] = []
@@ -135,7 +135,7 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
 
 
 def _farthest(thumbnails: Singles) -> list[int]:
-    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Their brightness does not count."""
+    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is ignored."""
     if not len(thumbnails):
         return []
     vectors = unit(thumbnails)
@@ -150,7 +150,7 @@ def _farthest(thumbnails: Singles) -> list[int]:
 
 @contextmanager
 def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
-    """Yield an opened film. What is raised for a damaged one becomes an InputError."""
+    """Yield an opened film, and convert the errors of a damaged one to an InputError."""
     import cv2
 
     check_file(film, "a film")

@@ -1,7 +1,8 @@
 """Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear values, and as masks.
 
-The one check, and the one message, for the sizes of images and the memory of captures: before they are decoded, from
-what their header says. A few kilobytes may claim gigabytes of pixels, by mistake or by intent.
+The sizes of images and the memory of captures are checked only here, with the same messages everywhere. The check uses
+the header, before anything is decoded: a file of a few kilobytes may state gigabytes of pixels, by mistake or by
+intent.
 
 Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the
 container is checked before it is decoded, and the messages of the C libraries are caught and searched.
@@ -49,10 +50,10 @@ class ExpectedSize:
 
     shape: tuple[int, ...]  # (H, W) or (H, W, C)
     like: str  # whose size it is, for messages, such as the name of the first image
-    what: str = "an image"  # what the image is, with its article
+    what: str = "an image"  # description of the image, with its article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
-        """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
+        """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
             raise InputError(
                 f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
@@ -62,7 +63,7 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError where an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
+    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
     if expected is not None:
         expected.check(shape, path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
@@ -74,7 +75,7 @@ def check_stored_size(
 
 
 def check_vectors(shape: tuple[int, ...], path: Path) -> None:
-    """Raise InputError where an array is not H x W x 3."""
+    """Raise InputError if an array is not H x W x 3."""
     if len(shape) != 3 or shape[2] != 3:
         sizes = " x ".join(map(str, shape))
         raise InputError(f"found an array of {sizes}, expected a normal map, H x W x 3", path=path)
@@ -86,7 +87,7 @@ def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
 
 
 def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = None) -> None:
-    """Raise InputError where less memory is available; `takes` is the message's subject and verb."""
+    """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
         problem = f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available"
@@ -104,12 +105,12 @@ def _gigabytes(n_bytes: float) -> str:
 def common_size(images: Sequence[ImageFacts]) -> StoredSize:
     """Return the size of the largest of some images.
 
-    Raises InputError where one has another height or width than the first, is too large, or has no whole header.
+    Raises InputError if one has another height or width than the first, is too large, or has an incomplete header.
     """
     first = images[0]
     check_stored_size(*first.size, first.path)
     expected = ExpectedSize(first.size[0], first.path.name)
-    # Opening a RAW file takes long. Its size is compared when it is decoded.
+    # Opening a RAW file is slow, so its size is compared when it is decoded.
     asked = [first, *(image for image in images[1:] if image.kind != "RAW")]
     for image in asked[1:]:
         expected.check(image.size[0], image.path)
@@ -127,14 +128,14 @@ _LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previe
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
-    The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
+    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
     and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
     EXIF orientation is ignored, because all images of a capture share one pixel grid. The header is compared with the
     expected size.
 
     Raises:
         InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
-            image has not the expected size, or is too large (see check_stored_size).
+            image does not have the expected size, or is too large (see check_stored_size).
     """
     return decode_with_alpha(path, expected)[0]
 
@@ -292,8 +293,8 @@ def to_linear(stored: Array, path: Path) -> Singles:
 def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
-    So 0 and 1 serve as well as 0 and 255. If an alpha channel cuts something out, it alone is the mask, because colours
-    mean nothing in such an image.
+    So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the mask, because
+    colours mean nothing in such an image.
 
     Raises:
         InputError: the image cannot be read, or no pixel is above zero.
@@ -313,7 +314,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
 def cut_out(alpha: Array | None) -> Bools | None:
     """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
 
-    Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
+    A pixel is opaque above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
     """
     opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)
     return opaque if opaque is not None and opaque.any() and not opaque.all() else None

@@ -1,13 +1,12 @@
-"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, such as those of scanners.
+"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, for example from scanners.
 
 Frame: x right, y up, z to the camera. A file is one of
 
 - MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array; and .npy. Unsigned integers are a picture;
 - .txt: H*W rows of x y z in row-major order, for ground truth only;
-- a picture: n = 2 v / full scale - 1, black or mid-gray where there is no normal; a floating-point TIFF contains n
-  itself.
+- a picture: n = 2 v / full scale - 1, black or mid-gray without a normal; a floating-point TIFF contains n itself.
 
-Vectors are scaled to unit length. Zero and non-finite vectors are no normals. Depth maps are floating-point .npy, TIFF
+Vectors are scaled to unit length. Zero and non-finite vectors are not normals. Depth maps are floating-point .npy, TIFF
 and OpenEXR files.
 """
 
@@ -44,25 +43,25 @@ _LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or
 _FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has unit length by chance
 _LARGEST = 1e100  # values of damaged files may have an infinite square
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
-_LONGEST_NUMBER = 32  # characters of a number in a text, with what separates it from the next
+_LONGEST_NUMBER = 32  # characters of a number in a text, with the separator after it
 
 
 class _Stored(NamedTuple):
     """Vectors as a file stores them."""
 
-    values: Array  # (H, W, 3); those of a picture are colours, n = 2 v / full scale - 1
+    values: Array  # (H, W, 3); a picture's values are colours, n = 2 v / full scale - 1
     alpha: Array | None  # (H, W), the alpha channel of a picture
     is_picture: bool
 
 
 def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl") -> Singles:
-    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero where there is no normal.
+    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a normal.
 
     Args:
         path: any of the files above but text.
         mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
             something out, that is left out, too.
-        convention: whether green is y up or y down where the values are colours.
+        convention: whether green is y up or y down in a picture.
 
     Raises:
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
@@ -87,10 +86,10 @@ def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, conventi
 
 
 def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Singles, bool]:
-    """Return ground truth (H, W, 3) float32, and whether its rows were turned upside down.
+    """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
-    Vectors have unit length, or are zero outside the mask and where there is no ground truth. Rows of text are turned
-    upside down where they fill the mask clearly better this way, as in the normal.txt of DiLiGenT's Harvest.
+    Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text files are flipped
+    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest.
 
     Args:
         path: any of the files above; pictures as PNG or TIFF.
@@ -124,7 +123,7 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
             values = read_mat(path, expected)
     elif suffix == ".npy":
         with damage_as_input_error(path, "the .npy file is damaged, or contains no array of numbers"):
-            # A map of the file, which reads the header alone. It refuses a file that is shorter than its header says.
+            # A map of the file, which reads the header alone. It rejects a file that is shorter than its header states.
             array = np.lib.format.open_memmap(path, mode="r")
             check_vectors(array.shape, path)
             check_stored_size(array.shape, array.dtype.itemsize, path, expected)
@@ -155,7 +154,7 @@ def _read_text(path: Path, height: int, width: int) -> Doubles:
 
 
 def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False) -> Singles:
-    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are no normals.
+    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are not normals.
 
     With check_floats, floating-point values must have about unit length, too, as colours must.
     """
@@ -179,7 +178,7 @@ def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool 
 
 
 def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
-    """Raise InputError for colours or vectors (H, W, 3) that are no directions, such as those of a photograph."""
+    """Raise InputError for colours or vectors (H, W, 3) that are not directions, such as a photograph's colours."""
     vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float64)
     if stored.dtype.kind == "u":
         vectors = vectors * (2 / np.iinfo(stored.dtype).max) - 1
@@ -199,10 +198,10 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
 
 
 def read_depth(path: Path, expected: ExpectedSize) -> Doubles:
-    """Return a depth map (H, W) float64, NaN where it is not finite: there, nothing is known.
+    """Return a depth map (H, W) float64, NaN where it is not finite because the depth is unknown.
 
     Raises:
-        InputError: the file cannot be read, is no map of floating-point numbers, or has another size.
+        InputError: the file cannot be read, is not a map of floating-point numbers, or has another size.
         UsageError: the file is an EXR file, and OpenEXR is not installed.
     """
     check_file(path, "a depth map")
@@ -233,7 +232,7 @@ def _read_exr(path: Path, expected: ExpectedSize) -> Array:
             low, high = library.File(name, header_only=True).header()["dataWindow"]
         shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
         check_stored_size(shape, 4, path, expected)
-        # Of damaged pixels, the library only prints a warning; stdout belongs to the product of a command.
+        # For damaged pixels, the library only prints a warning, and stdout is reserved for the product of a command.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():

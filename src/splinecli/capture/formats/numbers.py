@@ -1,7 +1,7 @@
 """Numbers in text files, with any separator, byte order marks, comments and blank lines, and in MATLAB's .mat files of
 version 5, 6 and 7 (MathWorks, "MAT-File Format").
 
-A reader of its own, for arrays of real numbers alone: SciPy's ends the process at types that it does not know.
+We have our own .mat reader, only for arrays of real numbers, because SciPy's ends the process at unknown types.
 """
 
 import codecs
@@ -34,7 +34,7 @@ _FROM_PIPES: dict[Path, bytes] = {}
 WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
 
 MOST_TEXT = 1_000_000
-"""Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
+"""Bytes of the longest text file that is read, unless the number of images sets the limit: 14,000 lights."""
 
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"  # hint for a line with decimal commas
 
@@ -53,7 +53,7 @@ class NumberRows:
 
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
-    names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
+    names: tuple[str, ...] | None = None  # of each row's image, without folders; None if rows begin with numbers
     intensities: Doubles | None = None  # (R, 3), RGB, of the lights of a file that has them
     are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
 
@@ -80,7 +80,7 @@ def has_decimal_commas(text: str) -> bool:
 
 
 def check_length(path: Path, most: int, expected: str = "a text file") -> None:
-    """Raise InputError for a text file of more than `most` bytes, or for something that is no file."""
+    """Raise InputError for a text file of more than `most` bytes, or for something that is not a file."""
     check_file(path, expected)
     length = path.stat().st_size
     if length > most:
@@ -92,9 +92,10 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
-    """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
+    """Return the bytes of a text file, or of a pipe instead: the shell's `<(...)`, which can be read only once.
 
-    Raises InputError if it is missing, no file, or longer than `most` bytes. Messages say that `expected` was expected.
+    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages name `expected` as the
+    expected content.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
@@ -115,8 +116,8 @@ def read_lines(
 ) -> list[str]:
     """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one. Raises InputError.
 
-    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows write. The other
-    arguments are those of read_text.
+    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows write. For the other
+    arguments, see read_text.
     """
     content = read_text(path, most=most, expected=expected)
     is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -138,8 +139,8 @@ def read_lines(
 def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
-    The arguments are those of read_text. Raises InputError with the line for a word that is no finite number; also for
-    a file without numbers.
+    For the arguments, see read_text. Raises InputError with the line for a word that is not a finite number; also for a
+    file without numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
@@ -147,7 +148,7 @@ def read_number_rows(path: Path, *, expected: str = "a text file", most: int = M
 def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT) -> list[WordRow]:
     """Return the words of each line that has any, with points for decimal commas. Raises InputError.
 
-    At the end of a line, n_numbers stand. See read_text for the other arguments.
+    A line ends with n_numbers numbers. See read_text for the other arguments.
     """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
@@ -177,7 +178,7 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
-    """Return whether lines have decimal commas, such as "0,5 0,3 0,8": their last numbers stand apart without them."""
+    """Return whether the last numbers of lines have decimal commas and other separators, as in "0,5 0,3 0,8"."""
     tails = [_SEPARATORS_BESIDE_COMMAS.split(text)[-n_numbers:] for text in texts]
     is_match = _NUMBER_WITH_COMMA.fullmatch
     rows = [words for words in tails if len(words) == n_numbers and any(map(is_match, words))]
@@ -186,7 +187,7 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
 
 
 def to_number(word: str) -> float | None:
-    """Return the number that a word stands for, finite or not; None for another word."""
+    """Return the number that a word represents, finite or not; None for another word."""
     try:
         # float() also takes Python's notation "1_000", but "2024_01" is the name of an image.
         return float(word) if "_" not in word else None
@@ -195,7 +196,7 @@ def to_number(word: str) -> float | None:
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
+    """Return the finite number that a word of a text file represents. Raises InputError with the line."""
     value = to_number(word)
     if value is None or not np.isfinite(value):
         what = "a number" if value is None else "a finite number"
@@ -209,7 +210,8 @@ _TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
-"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that has them: a double may lie as bytes."""
+"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them: a double may be stored
+as bytes."""
 _COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
@@ -234,7 +236,7 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
     Sizes are checked before anything is read or expanded.
 
     Raises:
-        InputError: there is no such array, or it is too large or not of the expected size.
+        InputError: the array is missing, too large or not of the expected size.
         KeyError, ValueError, struct.error, zlib.error: the file is damaged.
     """
     with path.open("rb") as file:
@@ -293,7 +295,7 @@ def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
 
 
 def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: bool) -> memoryview:
-    """Return the content of a matrix, at most so many bytes of it."""
+    """Return the content of a matrix, up to a number of bytes."""
     file.seek(start)
     content = file.read(min(length, most))
     if compressed:
@@ -306,7 +308,7 @@ def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     place = 0
     while place + _TAG_BYTES <= len(content):
         kind, length = struct.unpack_from(order + "II", content, place)
-        if kind >> 16:  # up to four bytes stand in the tag
+        if kind >> 16:  # up to four bytes are stored in the tag
             yield kind & 0xFFFF, content[place + 4 : place + 4 + (kind >> 16)]
             length = 0
         else:
