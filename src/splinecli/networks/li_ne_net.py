@@ -8,21 +8,21 @@ from torch import Tensor, nn
 
 from splinecli.networks.config import NetworkConfig
 
-PATCH = 4  # side in cells of the patches that an encoder joins into one position
+PATCH = 4  # side length in cells of the patches that an encoder combines into one position
 Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
 
 
 def zeroed(layer: Layer) -> Layer:
-    """Set the weights and offsets of a layer to zero and return it: what it corrects stays as it is at first."""
+    """Set the weights and offsets of a layer to zero and return it, so that its correction is zero at first."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))) on (P, C, h, w), zero outside of a mask if there is one.
+    """x + conv3x3(relu(conv3x3(relu(x)))) on (P, C, h, w), zero outside the mask, if given.
 
-    It has no norm and starts as the identity.
+    It has no normalisation and starts as the identity.
     """
 
     def __init__(self, width: int) -> None:
@@ -32,7 +32,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         hidden: Tensor = self.first(torch.relu(x))
-        # In place: a tile's maps of 32 channels decide how much memory is needed.
+        # In place, because a tile's maps of 32 channels determine the memory required.
         change: Tensor = self.second((hidden if mask is None else hidden.mul_(mask)).relu_())
         if mask is not None:
             change.mul_(mask)
@@ -42,8 +42,8 @@ class ResidualBlock(nn.Module):
 class MapEncoder(nn.Module):
     """Encodes maps (P, C, w, w) as features (P, width, w / 4, w / 4).
 
-    Each patch of 4 x 4 cells becomes one position; this is fast on a CPU. Each position gets a learned embedding. Cells
-    are light directions, so a map is not translation invariant as a photograph is.
+    Each patch of 4 x 4 cells becomes one position, which is fast on a CPU. Each position gets a learned embedding,
+    because cells are light directions, so unlike a photograph, a map is not translation invariant.
     """
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
@@ -66,8 +66,8 @@ class ErrorHead(nn.Module):
     """Estimates a log-logistic distribution of the error (P, 2) from NE-Net's hidden features and its normals.
 
     The first number is the logarithm of the median error in radians, with _MORE_DEG added. The second is the logarithm
-    of the distribution's shape: a larger shape means a narrower distribution. The other layers are fixed while this
-    one is trained, so it does not change the normals.
+    of the distribution's shape: a larger shape means a narrower distribution. The other layers are fixed while the
+    head is trained, so it does not change the normals.
     """
 
     def __init__(self, features: int, normals: int) -> None:
@@ -75,16 +75,16 @@ class ErrorHead(nn.Module):
         self.layers = nn.Sequential(nn.Linear(features + 3 * normals, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 2))
 
     def forward(self, features: Tensor, normals: Tensor) -> Tensor:
-        """Estimate from features (P, C) and normals (P, K, 3): those of the fits, and the estimate before scaling."""
+        """Estimate from features (P, C) and normals (P, K, 3): the fitted normals, and the estimate before scaling."""
         error: Tensor = self.layers(torch.cat((features, normals.flatten(1).to(features.dtype)), dim=1))
         return error.float()
 
 
-_MORE_DEG = 0.1  # Added to all errors. Without it, the logarithm would weigh differences between tiny errors.
+_MORE_DEG = 0.1  # Added to all errors. Otherwise the logarithm would emphasise differences between tiny errors.
 
 
 def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
-    """Return minus the log-likelihood (P,) of the logarithms of errors (P,), in radians, under distributions (P, 2)."""
+    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under distributions (P, 2)."""
     median, shape = error.unbind(-1)
     z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
     return z + 2 * nn.functional.softplus(-z) - shape
@@ -101,17 +101,17 @@ def median_error_deg(error: Tensor) -> Tensor:
     return error[:, 0].exp().rad2deg() - _MORE_DEG
 
 
-PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features of confidence.py
-_MOST = 4.0  # standard deviations of a feature from its mean
+PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features from confidence.py
+_MOST = 4.0  # largest deviation of a feature from its mean, in standard deviations
 _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES
 
 
 class CaptureHead(nn.Module):
-    """Changes log-logistic distributions of errors (P, 2), whose two numbers ErrorHead describes.
+    """Adjusts log-logistic distributions of errors (P, 2), whose two numbers are described in ErrorHead.
 
-    Wrong lights and values add an error of their own, whatever the network expects. The new median is therefore the
-    scaled old one, plus one that the features give, plus a share of the turn by encoded values. The head is small on
-    purpose: it learned from hundreds of captures only.
+    Wrong lights and values add an error of their own, whatever error the network predicts. The new median is therefore
+    the scaled old one, plus one predicted from the features, plus a share of the rotation due to gamma-encoded values.
+    The head is small on purpose: it was trained on only hundreds of captures.
     """
 
     mean: Tensor
@@ -129,22 +129,22 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            self.linear.bias[1] = -3.5  # before training, the logarithm of the median error in radians
+            self.linear.bias[1] = -3.5  # initial value of the logarithm of the median error in radians
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
-        """Return the changed distributions (P, 2).
+        """Return the adjusted distributions (P, 2).
 
         Args:
             errors: (P, 2), distributions of the errors.
             pixels: (P, 2), features of the pixels.
-            capture: (20,) or (P, 20), features of the capture, in the order of CaptureFeatures. NaN is unknown.
+            capture: (20,) or (P, 20), features of the capture, in the order of CaptureFeatures. NaN means unknown.
         """
         inputs = torch.cat((errors, pixels, capture.expand(len(errors), -1)), dim=1)
         inputs = ((inputs - self.mean) / self.spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
         found = self.linear(inputs) + self.last(self.hidden(inputs).tanh())
         median = torch.logaddexp(errors[:, 0] + found[:, 0], found[:, 1])
-        # However well all else fits: encoded values turn the normals by about so much.
-        bent = capture[..., 11] + math.log(math.pi / 180) + self.bend  # the place of CaptureFeatures.bend_turn
+        # Gamma-encoded values rotate the normals by about this angle, however good the fit is otherwise.
+        bent = capture[..., 11] + math.log(math.pi / 180) + self.bend  # 11 is the index of CaptureFeatures.bend_turn
         median = torch.logaddexp(median, bent.expand(len(errors)))
         return torch.stack((median, errors[:, 1] + found[:, 2]), dim=1)
 
@@ -153,9 +153,9 @@ class PaperLINet(nn.Module):
     """The authors' LI-Net (Zheng et al., ICCV 2019): (P, 1, w, w) to the same shape, in 0..1; 8.40 M parameters.
 
     Its layers are a 7x7 conv to 64 channels, two 4x4 convs of stride 2 to 128 and 256, six residual blocks, two
-    transposed convs back, a 7x7 conv and a sigmoid. No conv has a bias. An instance norm with a scale and an offset for
-    each channel follows every conv but the last. It normalises by the statistics of each map, also after training:
-    the authors track running statistics but never use them.
+    transposed convs back, a 7x7 conv and a sigmoid. No conv has a bias. An instance norm with a scale and an offset per
+    channel follows every conv but the last. It normalises by the statistics of each map, even after training: the
+    authors track running statistics but never use them.
     """
 
     def __init__(self) -> None:
@@ -206,7 +206,7 @@ class CompactLINet(nn.Module):
         return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)
 
 
-DROPOUT = 0.2  # share of the channels that the paper size drops in training
+DROPOUT = 0.2  # share of the channels dropped in training at the paper size
 
 
 class PaperNENet(nn.Module):
@@ -214,8 +214,8 @@ class PaperNENet(nn.Module):
 
     It has 2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128 layer. As in the
     authors' code, no ReLU comes before the last 1x1 conv or between the two linear layers, and the pooling
-    windows overlap: 4 x 4 at a stride of 2. Dropout removes whole channels, in training only. The authors leave it on
-    when they test, which adds noise to their normals.
+    windows overlap: 4 x 4 at a stride of 2. Dropout removes whole channels, in training only. The authors leave it
+    enabled at test time, which adds noise to their normals.
     """
 
     def __init__(self, channels: int, map_size: int) -> None:
@@ -256,9 +256,9 @@ class _DenseBlock(nn.Module):
 class CompactNENet(nn.Module):
     """Maps (P, 4 or 5, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
 
-    The result is a weighted sum of the starting normals plus a correction. At first the first normal has weight 1, and
-    all else is zero. With K = 0 this weight is fixed. Features (P, set_width) of the set branch join the hidden layer.
-    The second result is that of the error head (P, 2), None without one.
+    The result is a weighted sum of the starting normals plus a correction. Initially the first normal has weight
+    1, and all else is zero. With K = 0 this weight is fixed. Features (P, set_width) from the set branch are added to
+    the hidden layer. The second result is the output of the error head (P, 2), None without one.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -285,7 +285,7 @@ class CompactNENet(nn.Module):
         self, maps: Tensor, normals: Tensor, set_features: Tensor | None = None
     ) -> tuple[Tensor, Tensor | None]:
         features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
-        # Patches first, channels last: this is the order in memory, so flattening does not copy.
+        # Patches first, channels last, as in memory, so flattening does not copy.
         hidden = self.hidden(features.permute(0, 2, 3, 1).flatten(1))
         if self.join is not None and set_features is not None:
             hidden = hidden + self.join(set_features)
@@ -293,7 +293,7 @@ class CompactNENet(nn.Module):
             start = normals[:, 0]
         else:
             hidden = hidden + self.compare(normals[:, 1:].flatten(1))
-            # In float32 whatever the layers compute in, because the sum needs the digits of the normals.
+            # Always in float32, because the sum needs the full precision of the normals.
             weight = self.weigh(torch.relu(hidden)).float()
             start = (weight[..., None] * normals).sum(dim=1)
         hidden = torch.relu(hidden)

@@ -1,4 +1,4 @@
-"""The light network: reads the direction and the relative intensity of the light of each image of a capture."""
+"""The light network, which estimates the light direction and relative intensity of each image in a capture."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, softplus
 
-SIDE = 48  # height and width of the images that the network sees
+SIDE = 48  # height and width of the input images
 INPUTS = 4
 _WIDTHS = 24, 48, 96, 128
 _JOINED = 64
@@ -14,7 +14,7 @@ _HIDDEN = 192
 
 
 class LightGuess(NamedTuple):
-    """What the network reads off the F images of each of B captures."""
+    """Estimated lights of the F images in each of B captures."""
 
     directions: Tensor  # (B, F, 3), unit; the modes of von Mises-Fisher distributions
     sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
@@ -22,10 +22,10 @@ class LightGuess(NamedTuple):
 
 
 class LightNet(nn.Module):
-    """An encoder that is the same for all images, and sees at three depths what the others show.
+    """An encoder, shared by all images, that exchanges information between the images at three depths.
 
-    At each depth, the features of an image are joined with their maximum and their mean over all images, as in LCNet
-    (Chen et al., "Self-calibrating deep photometric stereo networks", CVPR 2019), which joins once.
+    At each depth, the features of an image are concatenated with the maximum and the mean over all images. LCNet (Chen
+    et al., "Self-calibrating deep photometric stereo networks", CVPR 2019) does this once.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class LightNet(nn.Module):
         self.out = nn.Linear(_HIDDEN, 6)
 
     def forward(self, images: Tensor) -> LightGuess:
-        """Read the lights of images (B, F, INPUTS, SIDE, SIDE); see network_inputs."""
+        """Estimate the lights of images (B, F, INPUTS, SIDE, SIDE); see network_inputs."""
         captures, lights = images.shape[:2]
         x = torch.relu(self.enter(images.flatten(0, 1).contiguous(memory_format=torch.channels_last)))
         x = torch.relu(self.local[0](x))
@@ -59,24 +59,25 @@ class LightNet(nn.Module):
         x = torch.relu(x + self.join3(_with_all(x, lights)))
         found = self.out(x).view(captures, lights, 6)
         height = softplus(found[..., 2:3] + 1)
-        # Errors of 90 degrees and of 1 degree
+        # The limits correspond to errors of 90 degrees and 1 degree.
         sharpness = (3 + found[..., 3]).clamp(-2.0, 8.5)
         intensities = found[..., 4] - found[..., 4].mean(dim=1, keepdim=True)
         return LightGuess(normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities)
 
 
 def _with_all(x: Tensor, lights: int) -> Tensor:
-    """Return features (B * F, C, ...) of images, with the maximum and the mean over the images of each capture."""
+    """Concatenate features (B * F, C, ...) of images with their maximum and mean over the images of each capture."""
     each = x.view(-1, lights, *x.shape[1:])
     largest, mean = each.amax(dim=1, keepdim=True), each.mean(dim=1, keepdim=True)
     return torch.cat((each, largest.expand_as(each), mean.expand_as(each)), dim=2).flatten(0, 1)
 
 
 def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
-    """Return what the network sees (F, INPUTS, H, W) of images (F, H, W): linear, of any scale, 0 or more.
+    """Return the input channels (F, INPUTS, H, W) for images (F, H, W): linear, non-negative, of any scale.
 
-    Channels: the image, the image over the mean of all images, which hardly depends on the material, that mean, and the
-    mask (H, W), 1 on the object, else 0. The first and the third are roots, as shares of the object's mean brightness.
+    Channels: the image; the image divided by the mean of all images, which hardly depends on the material; that mean;
+    and the mask (H, W), 1 on the object, else 0. The first and the third are square roots, relative to the object's
+    mean brightness.
     """
     images = images * mask
     mean = images.mean(dim=0)
@@ -88,7 +89,7 @@ def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
 
 
 def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Cut images (F, H, W) to the box of a mask (H, W), pad them to squares and resize these to SIDE.
+    """Crop images (F, H, W) to the bounding box of a mask (H, W), pad them to squares and resize them to SIDE.
 
     Returns images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros and ones.
     """

@@ -1,6 +1,6 @@
-"""The refinement net, which corrects a map of normals and of their errors, and the features that it reads.
+"""The refinement net, which corrects maps of normals and their errors, and the layout of its input features.
 
-refinement/features.py computes the features.
+The features are computed in refinement/features.py.
 """
 
 import math
@@ -15,44 +15,44 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 from splinecli.networks.li_ne_net import ResidualBlock, zeroed
 
 FEATURE_WIDTHS = {
-    "normal": 3,  # the estimated one
-    "robust": 3,  # the normal of the robust Lambertian fit, minus the estimated one
-    "plain": 3,  # the normal of least squares, minus the estimated one
-    "unexplained_light": 2,  # mean light direction, weighted by what a matte surface with this normal leaves
+    "normal": 3,  # the estimated normal
+    "robust": 3,  # the normal of the robust Lambertian fit, minus the estimated normal
+    "plain": 3,  # the least-squares normal, minus the estimated normal
+    "unexplained_light": 2,  # mean light direction, weighted by the residuals of a matte surface with this normal
     "mean_light": 2,
     "light_moments": 3,  # xx, yy and xy of the light directions
-    "error_median": 1,  # of the error's distribution; see networks/li_ne_net.py
+    "error_median": 1,  # median of the error distribution; see networks/li_ne_net.py
     "error_shape": 1,
     "largest": 1,  # logarithm of the largest observation, relative to the capture
-    "mean": 1,  # of the observations, over the largest; the next two likewise
+    "mean": 1,  # of the observations, divided by the largest; likewise the next two
     "deviation": 1,
     "residual": 1,  # root mean square
     "dark_share": 1,  # share of dark observations
     "n_lights": 1,  # logarithm
-    "halves": 3,  # how two halves of the lights differ; the sign means nothing. See TwoHalves
-    "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of refinement/detail.py
+    "halves": 3,  # difference between two halves of the lights; the sign is arbitrary. See TwoHalves
+    "noise": 1,  # of least squares; not read by the net, but used by restore_detail in refinement/detail.py
 }
-"""The features and their numbers of channels. Vectors have x and y first."""
+"""The features and their numbers of channels. The first two channels of a vector are x and y."""
 
 _VECTORS = ("normal", "robust", "plain", "unexplained_light", "mean_light", "halves")
 
 
 def channels(name: str) -> slice:
-    """Return the channels of a feature."""
+    """Return the slice of a feature's channels."""
     names = list(FEATURE_WIDTHS)
     start = sum(FEATURE_WIDTHS[other] for other in names[: names.index(name)])
     return slice(start, start + FEATURE_WIDTHS[name])
 
 
 CHANNELS = sum(FEATURE_WIDTHS.values())
-READ = channels("noise").start  # number of the channels that the net reads
+READ = channels("noise").start  # number of channels read by the net
 VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VECTORS)
-"""Channels that hold the x and y of vectors, and turn with the image."""
+"""Channels with the x and y components of vectors, which rotate with the image."""
 
 _FIRST = channels("light_moments").start
-TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)  # channels that hold the xx, yy and xy of a tensor
+TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)  # channels with the xx, yy and xy components of a tensor
 _ERROR = slice(channels("error_median").start, channels("error_shape").stop)
-MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
+MEDIAN_OFFSET = 3.0  # shifts the logarithm of typical errors in radians close to zero
 
 
 def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,7 +67,7 @@ def _error_offset(features: Tensor) -> Tensor:
 def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
     """Return maps of features (B, CHANNELS, H, W) with other normals (B, 3, H, W) and errors (B, 2, H, W).
 
-    What describes how the estimated normal explains the observations stays as it is.
+    The features that describe how well the estimated normal explains the observations are not updated.
     """
     turned = features[:, channels("normal")] - normals
     changed = features.clone()
@@ -78,30 +78,31 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
     return changed
 
 
-WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
-ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks of each scale on the way down
-SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of the smoothed normals that the net weighs against the estimated one
+WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resolution
+ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks at each scale of the encoder
+SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of smoothed normals, which the net weights against the estimated normal
 
-# Logarithms of errors in radians, for the weights of the smoothing.
+# Limits of the log median error in radians, for the smoothing weights.
 _LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
-COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of the coarsest scale's pixels. The origins of tiles are multiples of it.
+COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
 Part = tuple[slice, slice]  # rows and columns of a map
 
 
 class RefineNet(nn.Module):
-    """An encoder-decoder of four scales with residual blocks. It has no norm and starts as the identity.
+    """An encoder-decoder of four scales with residual blocks, no normalisation, and the identity as initial state.
 
-    The result is the estimated normal, plus weighted differences from it to smoothed normals, plus a correction.
+    The result is the estimated normal, plus weighted differences between smoothed normals and the estimate, plus a
+    correction.
 
-    After each layer, everything outside the mask is zero. A pixel outside the mask is therefore the same as one outside
-    of the image, so tiles with an overlap of `reach` give the same as the whole image.
+    After each layer, everything outside the mask is set to zero. Pixels outside the mask are therefore equivalent to
+    pixels outside the image, so tiles with an overlap of `reach` give the same result as the whole image.
 
     Args:
-        twice: whether a second such net, `again`, corrects the result. It reads what the first one reads, with the
-            first one's normals and errors.
+        twice: whether a second such net, `again`, corrects the result. It reads the same features as the first, with
+            the normals and errors replaced by the first net's results.
 
     Attributes:
-        reach: no pixel further away than this changes a result.
+        reach: distance in pixels beyond which other pixels do not affect a result.
     """
 
     def __init__(self, *, twice: bool = False) -> None:
@@ -115,18 +116,18 @@ class RefineNet(nn.Module):
         )
         self.decode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
-            for width, count in zip(WIDTHS, (1, 1, 0), strict=False)  # and on the way up
+            for width, count in zip(WIDTHS, (1, 1, 0), strict=False)  # in the decoder
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
         self.again = RefineNet() if twice else None
-        self.reach = 96 * (1 + twice)  # of one net
+        self.reach = 96 * (1 + twice)  # 96 per net
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H, W) of 1 and 0.
 
-        The features (B, CHANNELS, H, W) of refine_features are zero outside the mask, too. `inner` is the part of the
-        map that is wanted, whose bounds are multiples of COARSEST or the end; None for all. The decoder leaves the rest
-        out.
+        The features (B, CHANNELS, H, W) of refine_features are zero outside the mask, too. `inner` is the requested
+        part of the map, whose bounds are multiples of COARSEST or the end of the map; None for all. The decoder skips
+        the rest.
         """
         if self.again is not None:
             features = with_refined(features, *self._correct(features, mask, None)) * mask
@@ -139,7 +140,7 @@ class RefineNet(nn.Module):
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
-        # The number format of the layers. In training, the sums over the blocks stay in float32.
+        # The data type of the layers. In training, the sums over the blocks stay in float32.
         device = features.device.type
         layers = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else features.dtype
         stream = features.dtype if torch.is_grad_enabled() else layers
@@ -148,7 +149,7 @@ class RefineNet(nn.Module):
             masks.append(max_pool2d(masks[-1], 2))
         normals, error = (part.contiguous() for part in split_features(features))
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
-        # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
+        # In place if possible, because a tile's maps of 32 channels determine the memory required.
         read = features[:, :READ], *towards, mask
         x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
         mask, normals, error, *towards = (maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards))
@@ -161,7 +162,7 @@ class RefineNet(nn.Module):
                 x = block(x, masks[scale])
         origin = (0, 0)
         for scale in reversed(range(len(passed))):
-            # Pixels of each scale that the decoder needs around a part of the map, at least
+            # The minimum margin, in pixels of each scale, that the decoder needs around a part of the map
             wanted = _grown(inner, 4 << scale)
             within = masks[scale][_cells(wanted, (0, 0), scale)]
             x = self.up[scale](x[_cells(wanted, origin, scale + 1)])
@@ -178,7 +179,7 @@ class RefineNet(nn.Module):
 
 
 def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Return maps as the channels of one, with a border of zeros, in the layout that is fastest for the layers."""
+    """Concatenate maps along the channels, with a border of zeros, in the layout that is fastest for the layers."""
     batch, _, height, width = maps[0].shape
     size = batch, sum(part.shape[1] for part in maps), height + border[3], width + border[1]
     joined = torch.empty(size, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
@@ -192,13 +193,13 @@ def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype)
 
 
 def _grown(part: Part, margin: int) -> Part:
-    """Return a part with a margin, up to whole pixels of the coarsest scale. It may end behind the map."""
+    """Return a part with a margin, expanded to whole pixels of the coarsest scale. It may extend past the map."""
     rows, columns = (slice(max(0, side.start - margin), side.stop + -side.stop % COARSEST + margin) for side in part)
     return rows, columns
 
 
 def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
-    """Return the index of a part in a map of a scale that begins at the pixel `origin`."""
+    """Return the index of a part in a map of the given scale that begins at the pixel `origin`."""
     rows, columns = (
         slice(side.start - start >> scale, side.stop - start >> scale) for side, start in zip(part, origin, strict=True)
     )
@@ -206,7 +207,7 @@ def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisTyp
 
 
 def unit_maps(vectors: Tensor) -> Tensor:
-    """Scale vectors (..., 3, H, W) to unit length: faster than a norm over the channels. Zero vectors stay zero."""
+    """Scale vectors (..., 3, H, W) to unit length, faster than with a norm over the channels. Zero stays zero."""
     x, y, z = torch.split(vectors, 1, dim=-3)
     length = (x * x + y * y + z * z).clamp(min=1e-24).sqrt()
     return vectors / length
@@ -214,25 +215,25 @@ def unit_maps(vectors: Tensor) -> Tensor:
 
 def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
     """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask."""
-    # Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
+    # Weight normals by their certainty, the inverse of the median error, whose logarithm is given.
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
     return [unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS]
 
 
 def reach_of(sigma: float) -> int:
-    """Return how many pixels to either side a filter of this width sees."""
+    """Return the radius in pixels of a filter of this width."""
     return math.ceil(3 * sigma)
 
 
 def gaussian_sum(maps: Tensor, sigma: float) -> Tensor:
-    """Return sums of maps (..., H, W) with Gaussian weights, of which the largest is 1. Outside, maps count as zero."""
+    """Return sums of maps (..., H, W) with Gaussian weights, of which the largest is 1. Maps are padded with zeros."""
     reach = reach_of(sigma)
     kernel = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-reach, reach + 1)]
     return _filtered(_filtered(maps, kernel, -1), kernel, -2)
 
 
 def _filtered(maps: Tensor, kernel: Sequence[float], axis: int) -> Tensor:
-    # Faster than convolutions of so few channels.
+    # Faster than a convolution for so few channels.
     reach, size = len(kernel) // 2, maps.shape[axis]
     padded = pad(maps, (reach, reach) if axis == -1 else (0, 0, reach, reach))
     found = kernel[0] * padded.narrow(axis, 0, size)

@@ -1,9 +1,9 @@
-"""The set branch: attention over a pixel's observations as they are, and what the other pixels of a capture say about
-it.
+"""The set branch: attention over the raw observations of a pixel and over the other pixels of its capture.
 
-From ten observations, many pairs of a normal and a reflectance are possible. An object has few materials, and pixels
-with other normals show other sides of the same reflectance. Universal photometric stereo (Ikehata, CVPR 2022 and 2023)
-shows how much a network gains where pixels see each other. Here each pixel sees the tokens of a sample of its capture.
+Ten observations are consistent with many pairs of a normal and a reflectance. An object has few materials, and pixels
+with other normals sample the same reflectance at other angles. Universal photometric stereo (Ikehata, CVPR 2022 and
+2023) demonstrates the benefit of communication between pixels. Here each pixel attends to the tokens of a sample of its
+capture.
 """
 
 from typing import NamedTuple
@@ -18,14 +18,14 @@ from splinecli.fits.robust import inverse_3x3, lit_values, multiply_symmetric
 from splinecli.networks.config import HEAD_WIDTH
 from splinecli.networks.li_ne_net import zeroed
 
-SAMPLE = 256  # pixels of a capture that its other pixels see
+SAMPLE = 256  # number of pixels of a capture that all its pixels attend to
 
-_DARK_SHARE = 0.02  # see lit_values. Darker pixels, such as a black background, say nothing
-_LARGEST_LOG = 7.0  # of a pixel's brightness over that of its capture
+_DARK_SHARE = 0.02  # see lit_values. Darker pixels, such as a black background, carry no information
+_LARGEST_LOG = 7.0  # largest logarithm of a pixel's brightness relative to its capture
 
 
 class Summary(NamedTuple):
-    """What one layer says of G captures, from S pixels of each."""
+    """The summary of G captures in one layer, from S pixels of each."""
 
     keys: Tensor  # keys, values: (G, heads, S, width / heads)
     values: Tensor
@@ -33,15 +33,16 @@ class Summary(NamedTuple):
 
 
 class CaptureContext(NamedTuple):
-    """What the network knows of a capture."""
+    """Information about a capture that is shared by its pixels."""
 
     brightness: Tensor  # (1,), median of the largest observation of the sampled pixels
-    layers: tuple[Summary, ...]  # of the layers of the set branch
+    layers: tuple[Summary, ...]  # one for each layer of the set branch
 
 
 def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Return the rows of the pixels, with observations (P, F), that the others see: at most SAMPLE lit ones, evenly
-    spread. Where none is lit, the first one stands for all.
+    """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in (P, F).
+
+    These are at most SAMPLE lit pixels, evenly spaced. If no pixel is lit, the first one is used.
     """
     pixels, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
     return pixels if len(pixels) else np.zeros(1, np.intp)
@@ -57,9 +58,9 @@ def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
 
 
 class ContextLayer(nn.Module):
-    """Adds to the tokens of pixels what they find in the tokens of their capture: by attention and in the mean.
+    """Adds information from the tokens of a capture to the tokens of its pixels, by attention and as a mean.
 
-    At first, it adds nothing.
+    Initially, it adds nothing.
     """
 
     def __init__(self, width: int) -> None:
@@ -72,19 +73,19 @@ class ContextLayer(nn.Module):
         self.join = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.GELU(), zeroed(nn.Linear(2 * width, width)))
 
     def forward(self, tokens: Tensor, level: Tensor, captures: int, known: Summary | None) -> tuple[Tensor, Summary]:
-        """Return the changed tokens (P, width), and the summary of their captures.
+        """Return the updated tokens (P, width), and the summary of their captures.
 
         Args:
             tokens: (P, width).
             level: (P, 1), see brightness_level.
             captures: the number G of captures. Pixel p belongs to capture p % G.
-            known: the summary of one capture; None if the pixels themselves are the samples of theirs.
+            known: the summary of one capture; None to use the pixels themselves as the samples of their captures.
         """
         embedded = self.embed(torch.cat((tokens, level), dim=1)).view(-1, captures, tokens.shape[1]).transpose(0, 1)
         summary = self._summarise(embedded) if known is None else known
         queries = self.query_norm(embedded)
         with torch.autocast(tokens.device.type, enabled=False):
-            # In float32, as in the set branch.
+            # Use float32, as in the set branch.
             parts = _split(self.queries(queries.to(self.queries.weight.dtype))), summary.keys, summary.values
             found = nn.functional.scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
         seen = torch.cat((queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2)
@@ -101,18 +102,18 @@ def _split(tokens: Tensor) -> Tensor:
     return tokens.view(*tokens.shape[:2], 4, -1).transpose(1, 2)
 
 
-_PRIOR = 1e-4  # keeps the weighted least squares solvable where the weights leave fewer than three lights
+_PRIOR = 1e-4  # keeps the weighted least squares solvable if fewer than three lights have weight
 
 
 class SetBranch(nn.Module):
     """A transformer over the F observations of each pixel.
 
-    It has one token for each observation and one for the pixel. The token of an observation is made from its light
-    direction, value, residual of the Lambertian fit, and the cosines between the starting normals and its light and
-    half vector. The tokens give a weight and a corrected value for each observation, and least squares over these
-    gives a normal. At first the weights are equal and the values are not corrected.
+    It has one token for each observation and one for the pixel. The token of an observation is computed from
+    its light direction, its value, the residual of the Lambertian fit, and the cosines between the starting normals and
+    its light and half vector. The tokens yield a weight and a corrected value for each observation, and weighted least
+    squares gives a normal. Initially the weights are equal and the values are not corrected.
 
-    If it sees the capture, the pixel's token sees those of other pixels after each layer.
+    With capture context, the pixel's token attends to the tokens of other pixels after each layer.
     """
 
     def __init__(self, width: int, layers: int, normals: int, *, sees_capture: bool = False) -> None:
@@ -141,10 +142,10 @@ class SetBranch(nn.Module):
         The observed values and residuals (P, F) of each pixel are divided by its largest observation, `scale` (P, 1).
         The lights (P, F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals
         (P, K, 3) are unit or zero. Pixel p belongs to capture p % `captures`. Without a context, the pixels of each
-        capture see each other.
+        capture attend to each other.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
-        log_observed = (observed.clamp(min=0) + 1e-3).log()  # added to observations before their logarithm is taken
+        log_observed = (observed.clamp(min=0) + 1e-3).log()  # the offset keeps the logarithm finite
         values = torch.stack((observed, log_observed, residual), dim=-1)
         features = torch.cat((lights, values, lights @ normals.mT, half @ normals.mT), dim=-1)
         count = observed.shape[1] if valid is None else valid.sum(dim=1, keepdim=True)
@@ -175,7 +176,7 @@ class SetBranch(nn.Module):
 
 
 class _AttentionLayer(nn.Module):
-    """Attention and a perceptron on tokens (P, T, width). Each follows a layer norm and is added to its input."""
+    """Attention and a perceptron on tokens (P, T, width). Each is preceded by a layer norm and added to its input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -190,7 +191,7 @@ class _AttentionLayer(nn.Module):
         split = self.queries_keys_values(self.norm1(tokens)).view(pixels, count, 3, self.heads, HEAD_WIDTH)
         queries, keys, values = split.permute(2, 0, 3, 1, 4)
         if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
-            # PyTorch's attention on a CPU is slower in bfloat16 than in float32, and its gradient up to six times.
+            # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its gradient up to six times.
             queries, keys, values = queries.float(), keys.float(), values.float()
         with torch.autocast(tokens.device.type, enabled=False):
             attended = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
@@ -206,7 +207,7 @@ def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor
     prior = lights.new_tensor((_PRIOR, _PRIOR, _PRIOR, 0, 0, 0))
     products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
     matrix = weighted_sum(weight, products) + prior
-    # Where nothing else decides, the normal points to the camera.
+    # If otherwise undetermined, the normal points to the camera.
     vector = weighted_sum(weight * targets, lights) + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
     scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
     return nn.functional.normalize(torch.stack(scaled, dim=-1), dim=-1)

@@ -1,8 +1,8 @@
 """SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to normals.
 
-docs/method.md says what the compact size does differently. Its dense map has the scale of the sparse map, the largest
-observation. Values above 1 are cut off, so that a highlight under some other light does not change the scale of all
-other values.
+The differences of the compact size are described in docs/method.md. Its dense map has the scale of the sparse map, the
+largest observation. Values above 1 are clipped, so that a highlight under another light does not change the scale of
+all other values.
 """
 
 import math
@@ -22,10 +22,10 @@ RESIDUAL_LIMIT = 3.0
 
 
 class Rotation(NamedTuple):
-    """A turn of the lights about the view axis, and a reflection."""
+    """A rotation of the lights about the view axis, and a reflection."""
 
     turn_deg: float | Tensor = 0.0  # angle in degrees, a number or (P,)
-    # whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
+    # whether y is flipped after the rotation. An isotropic pixel looks the same if its lights are mirrored, too.
     mirror: bool = False
 
 
@@ -33,7 +33,7 @@ NO_ROTATION = Rotation()
 
 
 class PixelMaps(NamedTuple):
-    """Observation maps of P pixels and what belongs to them, in each pixel's own frame."""
+    """Observation maps of P pixels with the associated fits and lights, in each pixel's own frame."""
 
     # sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation
     sparse: Tensor
@@ -42,11 +42,11 @@ class PixelMaps(NamedTuple):
     lambertian_map: Tensor
     lambertian_normals: Tensor  # (P, 3), unit
     scale: Tensor  # (P, 1), the largest observation, which is 1 in the maps
-    fitted_normals: Tensor  # (P, K, 3), of the further fits in the configuration
-    # cosine, sine: (P,), of the turn from the capture's frame to the pixel's
+    fitted_normals: Tensor  # (P, K, 3), from the additional fits in the configuration
+    # cosine, sine: (P,), of the rotation from the capture's frame to the pixel's
     cosine: Tensor
     sine: Tensor
-    mirrored: bool  # whether y is flipped after the turn
+    mirrored: bool  # whether y is flipped after the rotation
     # observed, residuals: (P, F), the scaled observations and their residuals
     observed: Tensor
     residuals: Tensor
@@ -62,7 +62,7 @@ class Estimate(NamedTuple):
 
 
 class SplineNet(nn.Module):
-    """LI-Net, NE-Net and all steps between raw observations and normals; the refinement nets follow on the map."""
+    """LI-Net, NE-Net and all steps from raw observations to normals; the refinement nets then run on the normal map."""
 
     cells: Tensor
     inside: Tensor
@@ -99,8 +99,8 @@ class SplineNet(nn.Module):
     ) -> PixelMaps:
         """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
-        Those that are not valid (P, F) are left out. The rotation of the lights comes after that to the canonical
-        azimuth.
+        Observations that are not valid (P, F) are ignored. The given rotation is applied after the rotation to the
+        canonical azimuth.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale
@@ -109,7 +109,7 @@ class SplineNet(nn.Module):
         else:
             scaled_normals = observed.new_tensor((0.0, 0.0, 1.0)).expand(len(observed), 3)
         x, y, z = scaled_normals.unbind(-1)
-        # A fit that points away from the camera is moved to the rim, where the closest visible normal is.
+        # Move a fit that points away from the camera to the rim, which has the closest visible normal.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
         angle = torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
@@ -161,8 +161,8 @@ class SplineNet(nn.Module):
     ) -> Estimate:
         """Return the normals of NE-Net in the pixels' frames, and their errors.
 
-        Pixel p belongs to capture p % `captures`. The context is that of `encode_context`; without one, the pixels of
-        each capture see each other, if the network sees captures at all.
+        Pixel p belongs to capture p % `captures`. The context comes from `encode_context`; without one, the pixels of
+        each capture attend to each other, if the network has layers for capture context.
         """
         interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
@@ -187,10 +187,11 @@ class SplineNet(nn.Module):
         """Return normals in the capture's frame, and their errors.
 
         The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
-        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context is that of `encode_context`; without
-        one, all pixels see each other, if the network sees captures. See build_maps for the others.
+        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context comes from `encode_context`;
+        without one, all pixels attend to each other, if the network has layers for capture context. See build_maps for
+        the other arguments.
         """
-        # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
+        # Only the convolutions may run in bfloat16: the fits and the geometry of the maps need full precision.
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
         normals, error = self.estimate(maps, self.interpolate(maps), context=context)
@@ -199,10 +200,10 @@ class SplineNet(nn.Module):
     def encode_context(
         self, observations: Tensor, light_directions: Tensor, rotation: Rotation = NO_ROTATION
     ) -> CaptureContext | None:
-        """Return what a sample of a capture's pixels says about the others; None if the network sees no captures.
+        """Return the context of a capture from a sample of its pixels; None if the network does not use context.
 
-        The observations (P, F), the light directions and the rotation are those of `forward`. Some SAMPLE pixels
-        suffice.
+        The observations (P, F), the light directions and the rotation are as in `forward`. About SAMPLE pixels are
+        enough.
         """
         if self.set_branch is None or not self.config.sees_capture:
             return None
@@ -226,13 +227,13 @@ def _starting_normals(maps: PixelMaps) -> Tensor:
 
 
 def to_capture_frame(normals: Tensor, maps: PixelMaps) -> Tensor:
-    """Turn normals (P, 3) from the pixels' frames back into the capture's."""
+    """Rotate normals (P, 3) from the pixels' frames back into the capture's frame."""
     if maps.mirrored:
         normals = normals * normals.new_tensor((1.0, -1.0, 1.0))
     return rotate_about_view_axis(normals, maps.cosine, -maps.sine)
 
 
 def to_pixel_frame(vectors: Tensor, maps: PixelMaps) -> Tensor:
-    """Turn vectors (P, 3) from the capture's frame into the pixels'."""
+    """Rotate vectors (P, 3) from the capture's frame into the pixels' frames."""
     turned = rotate_about_view_axis(vectors, maps.cosine, maps.sine)
     return turned * turned.new_tensor((1.0, -1.0, 1.0)) if maps.mirrored else turned

@@ -1,11 +1,12 @@
-"""Weight files: safetensors with the configuration of the network and a checksum, and the import of the authors' own
-(Zheng et al., ICCV 2019). Nothing is unpickled.
+"""Weight files and the import of the original weights (Zheng et al., ICCV 2019).
 
-Their PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). Our network of size
-"paper" has the same layers but other conventions. The import changes the weights once to account for these:
+A weight file is a safetensors file with the configuration of the network and a checksum. Nothing is unpickled.
 
-- Rows: in their maps y grows with the row, in ours it falls. Every kernel is flipped along its height, and so are the
-  map rows that the first linear layer reads. All paddings are symmetric and all sizes even, so the result is the
+The authors' PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). Our network
+of size "paper" has the same layers but different conventions. The import converts the weights once:
+
+- Rows: y increases with the row in their maps and decreases in ours. Every kernel is flipped along its height, and so
+  are the map rows read by the first linear layer. All paddings are symmetric and all sizes even, so the result is the
   flipped result of their network.
 - Channels: theirs are (dense, sparse), ours are (sparse, dense).
 - Cells and disc: the setting grid = "cnn-ps".
@@ -41,9 +42,9 @@ FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
 LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
 LONGEST = 500_000_000
-"""Bytes of the longest file of tensors that is read; a checkpoint of the paper's networks has 170 MB."""
+"""Largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB."""
 
-_LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
+_LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 
 SHIPPED = resources.files("splinecli") / "assets"
@@ -51,7 +52,7 @@ SHIPPED = resources.files("splinecli") / "assets"
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network that is ready to estimate normals (float32, evaluation mode)."""
+    """A network ready to estimate normals (float32, evaluation mode)."""
 
     network: SplineNet
     name: str  # the shipped name, or the file name without its suffix
@@ -69,9 +70,9 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
 
 
 def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file, the same ones for the same content.
+    """Return the bytes of a safetensors file, identical for identical content.
 
-    The library writes the metadata in a random order.
+    The library itself writes the metadata in random order.
     """
     content = save(tensors, metadata)
     length = int.from_bytes(content[:_LENGTH_BYTES], "little")
@@ -100,7 +101,7 @@ def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors and the metadata of a safetensors file of splinecli, and verify its format and checksum.
 
-    Raises ModelError, with the hint, for a file that is missing, of another format, or damaged.
+    Raises ModelError, with the hint, if the file is missing, damaged or in another format.
     """
     try:
         if path.is_dir():
@@ -111,7 +112,7 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
             raise ModelError("no such file", path=path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
-            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > 1 << 20:  # a tensor has about 100
+            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > 1 << 20:  # a tensor takes about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}
@@ -155,13 +156,13 @@ def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) ->
 
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
-    """Load the network of a weight file, under a name or that of the file without its suffix. Raises ModelError."""
+    """Load the network in a weight file, named `name` or after the file without its suffix. Raises ModelError."""
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
     tensors, metadata = read_tensors(path, FORMAT, hint)
     config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
-    with torch.device("meta"):  # without memory: the configuration may ask for any size
+    with torch.device("meta"):  # allocates no memory, because the configuration may request any size
         load_strictly(SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path)
     network = SplineNet(config)
     load_strictly(network, tensors, path)
@@ -178,10 +179,10 @@ def shipped_names() -> list[str]:
 
 
 def manifest() -> dict[str, dict[str, Any]]:
-    """Return what assets/weights.json says of the shipped weights, by name.
+    """Return the entries of assets/weights.json, which describe the shipped weights, by name.
 
     Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training. Some
-    have `capture_head`, the `file` and `sha256` of what corrects the confidence of these weights by the whole capture.
+    have `capture_head`, the `file` and `sha256` of the head that adjusts the confidence using the whole capture.
     """
     entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
@@ -200,7 +201,7 @@ def untrained_warning(sha256: str, n_lights: int) -> list[str]:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except OSError:  # a name too long for a file
+    except OSError:  # the name is too long for a file name
         return False
 
 
@@ -219,7 +220,7 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
 
 
 def capture_head(sha256: str) -> CaptureHead | None:
-    """Load what corrects the confidence of weights with this checksum, or None. Raises ModelError."""
+    """Load the capture head for weights with this checksum, or None if they have none. Raises ModelError."""
     for entry in manifest().values():
         if entry["sha256"] == sha256 and "capture_head" in entry:
             with resources.as_file(SHIPPED / entry["capture_head"]["file"]) as path:
@@ -249,7 +250,7 @@ def _check_shipped(path: Path, sha256: str, name: str) -> None:
         )
 
 
-# Our module names and theirs of NE-Net. LI-Net differs in the name of its sequences.
+# Module names in NE-Net, ours and the authors'. In LI-Net, the names of the sequences differ.
 _NE_NET_MODULES = {
     "stem": "conv1",
     "dense1.first": "denseblock1_1.1",
@@ -263,15 +264,15 @@ _NE_NET_MODULES = {
 }
 _MOST_NAMES = 5
 _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
-"""Records of an archive, bytes and instructions of a pickle. The authors' have some dozens, 10 kB and 2,000."""
+"""Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000."""
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
     """Return the authors' network, float32, in evaluation mode, from two files of state dictionaries.
 
-    Their generator (G) is LI-Net, their discriminator (D) NE-Net. Dropout is off in evaluation mode, while the authors'
-    test code leaves it on. Raises ModelError if a file cannot be read or is not a state dictionary, or a tensor is
-    missing, unknown, of another shape or not finite.
+    Their generator (G) is LI-Net, their discriminator (D) is NE-Net. Dropout is disabled in evaluation mode, but the
+    authors' test code leaves it enabled. Raises ModelError if a file cannot be read or is not a
+    state dictionary, or a tensor is missing, unknown, of another shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
@@ -293,8 +294,8 @@ def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
     names = {name: name.replace("layers", "main") for name in li_net.state_dict()}
-    # Statistics that their instance norms collect in training. The authors' code normalises by the statistics of each
-    # map, also at test time (it never leaves the training mode), so these values are not used.
+    # Running statistics that their instance norms collect in training. The authors' code normalises by the statistics
+    # of each map, even at test time (it never leaves training mode), so these values are not used.
     tracked: dict[str, torch.Size] = {}
     for name, tensor in li_net.state_dict().items():
         norm, _, kind = names[name].rpartition(".")
@@ -315,7 +316,7 @@ def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
 def _rename(
     path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
 ) -> dict[str, Tensor]:
-    """Return their tensors under our names, float32; `names` gives theirs by ours, `dropped` the shapes not needed."""
+    """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists unused shapes."""
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
     missing = [name for name in shapes if name not in state]
@@ -339,14 +340,14 @@ def _rename(
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """Read the tensors of a file that torch.save wrote. Only tensors and plain containers are unpickled."""
+    """Read the tensors in a file written by torch.save. Only tensors and plain containers are unpickled."""
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
         check_file(path, "a checkpoint")
         check_length(path, hint)
         _check_content(path)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the errors below cover what PyTorch warns of
+            warnings.simplefilter("ignore")  # the errors below cover the PyTorch warnings
             state = torch.load(path, map_location="cpu", weights_only=True)
     except InputError as error:
         raise ModelError(error.problem, path=path, hint=hint) from error
@@ -354,7 +355,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
         raise
     except OSError as error:
         raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
-    except Exception as error:  # damaged pickles raise many kinds of errors
+    except Exception as error:  # damaged pickles raise many types of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
         isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor) for name, tensor in state.items()
@@ -368,13 +369,13 @@ def _is_plain(tensor: Tensor) -> bool:
 
 
 def _check_content(path: Path) -> None:
-    """Raise ValueError for a checkpoint that would take far more memory than it has bytes.
+    """Raise ValueError for a checkpoint that would use far more memory than its file size.
 
-    It may be an archive, as torch.save writes since 1.6, whose records are not compressed; or pickles and numbers.
+    It may be an archive with uncompressed records, as written by torch.save since 1.6, or pickles and numbers.
     """
     with path.open("rb") as file:
         if file.read(4) == b"PK\3\4":
-            # Before the directory is read: each record has such a mark in it.
+            # Count the records before reading the directory, which has one such mark for each record.
             if sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b"")) > _MOST_RECORDS:
                 raise ValueError("too many records")
             records = zipfile.ZipFile(file).infolist()

@@ -1,4 +1,4 @@
-"""Captures with ground truth and rendered scenes as entries of a pixel set."""
+"""Creation of pixel-set entries from captures with ground truth and from rendered scenes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 
 class CaptureChangedError(OutputError):
-    """A capture differs from the one that its entry was made from."""
+    """A capture has changed since its entry was created."""
 
 
 def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
-    """Choose the name of the entry of each capture, and return the folders by name.
+    """Choose an entry name for each capture, and return the folders by name.
 
-    A capture that is in the set keeps its name. A new capture is named after its folder, with a number if another
-    capture has that name. A folder that is given twice counts once, because its pixels must not both train and
-    validate.
+    A capture already in the set keeps its name. A new capture is named after its folder, with a number if another
+    capture has that name. Duplicate folders are used only once, because the same pixels must not be used for both
+    training and validation.
     """
     captures: dict[str, Path] = {}
     for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
@@ -58,18 +58,18 @@ def add_capture(
 ) -> None:
     """Read a capture and write its pixels with ground truth, unless the set has them.
 
-    Of the images of CyclesPS's PRPS, only every second row and column counts: the training of CNN-PS reads them at
-    half their size.
+    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains on them at half
+    resolution.
 
     Args:
-        as_stored: use the stored values alone. By default, saturated observations are restored and unknown light
+        as_stored: use the stored values unchanged. By default, saturated observations are restored and unknown light
             intensities are estimated, as `infer` does.
-        white_level: stored value from which a pixel counts as saturated; None to find it in the images.
+        white_level: stored value from which a pixel is considered saturated; None to estimate it from the images.
         update: replace an entry whose capture changed.
 
     Raises:
         InputError: the capture cannot be read, or has no ground truth.
-        CaptureChangedError: the capture changed since its entry was made, and `update` is not set.
+        CaptureChangedError: the capture changed since its entry was created, and `update` is not set.
         OutputError: the entry cannot be written.
     """
     source = open_capture(folder, white_level=white_level)
@@ -99,16 +99,16 @@ def add_capture(
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
     pixels = _pixels(source.read(as_stored=as_stored), source, folder)
-    # The materials of an object of CyclesPS share its shape.
+    # All materials of a CyclesPS object have the same shape.
     scene = source.files.folder.absolute().name if source.files.boundaries else name
     writer.add(name, scene, str(folder), recipe, pixels)
 
 
 def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
-    """Return the pixels of a capture that have a true normal. Raises InputError if there are none."""
+    """Return the pixels of a capture with ground-truth normals. Raises InputError if there are none."""
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
-    # The images of CyclesPS's PRPS count at half their size.
+    # The PRPS images of CyclesPS are used at half resolution.
     step = 2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
     rows, columns = np.nonzero(capture.mask)
     used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
@@ -124,29 +124,29 @@ def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
     )
 
 
-RENDERER = 5  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
+RENDERER = 5  # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
 
-# Meshes have random numbers of their own, so that a mesh changes no other scene.
+# Meshes have their own random streams, so that adding a mesh does not change any other scene.
 _FIRST_MESH_INDEX = 1_000_000
-_VIEWS = 10_000  # numbers from one view of a mesh to its next
+_VIEWS = 10_000  # difference between the numbers of consecutive views of a mesh
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first those of each mesh file, then `count` random ones."""
+    """The scenes to render: first the views of each mesh file, then `count` random scenes."""
 
     config: SceneConfig
     seed: int
     count: int
     meshes: tuple[Path, ...] = ()
-    views: int = 0  # random views of each mesh, see draw_view; 0 for one along its +z axis
+    views: int = 0  # random views per mesh, see draw_view; 0 for one view along its +z axis
     reliefs: tuple[Path, ...] = ()  # normal maps, for half of the scenes
 
     @cached_property
     def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
-        """The mesh of each of its scenes, the scene's name, and its number, which the count of views does not change.
+        """The mesh, name and number of each mesh scene; the number does not depend on the count of views.
 
-        The name is the file's, with a number if another mesh has it.
+        The name is the file name, with a number if another mesh has the same name.
         """
         taken: list[str] = []
         for path in self.meshes:
@@ -167,10 +167,10 @@ class ScenePlan:
         return {kind: f"{self.names[position]}-{kind}" for kind in MATERIALS}
 
     def recipe(self, position: int) -> dict[str, Any]:
-        """Return the values that decide the content of a scene."""
+        """Return the values that determine the content of a scene."""
         meshes = self._of_mesh[position : position + 1]
         shapes = [file_sha256(path) for path, _, _ in meshes]
-        if meshes and self.views:  # another mesh may touch it
+        if meshes and self.views:  # another mesh may be placed next to it
             shapes += [file_sha256(path) for path in self.meshes]
         return {
             "renderer": RENDERER,
@@ -182,7 +182,7 @@ class ScenePlan:
         }
 
     def check_inputs(self) -> None:
-        """Check what rendering needs, before anything is rendered.
+        """Check the inputs before rendering.
 
         Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the packages of the extra
         `render` are not installed.
@@ -196,7 +196,7 @@ class ScenePlan:
             read_relief(path)
 
     def check_set(self, writer: PixelSetWriter) -> None:
-        """Raise OutputError if the set has one of the scenes, rendered with other settings."""
+        """Raise OutputError if the set contains one of the scenes rendered with other settings."""
         for position in range(len(self.names)):
             recipe = self.recipe(position)
             for name in self.entry_names(position).values():
@@ -209,8 +209,8 @@ class ScenePlan:
     def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
         """Render a scene; return its shape in words, and the pixels by material.
 
-        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or the
-        camera sees nothing; UsageError if the packages of the extra `render` are not installed.
+        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or
+        nothing is visible to the camera; UsageError if the packages of the extra `render` are not installed.
         """
         mesh_file = mesh = None
         index = position - len(self._of_mesh)
@@ -235,7 +235,7 @@ class ScenePlan:
         return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
 
     def _shape_name(self, position: int) -> str:
-        """Return what the views of a mesh share, because they must not both train and validate."""
+        """Return the name common to all views of a mesh, which are all used for training or all for validation."""
         return self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
 
     def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
@@ -246,13 +246,13 @@ class ScenePlan:
 
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
-    """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
+    """Write the pixels of a scene to a file for load_rendered. Raises OutputError."""
     arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
 
 def load_rendered(path: Path) -> dict[str, Pixels]:
-    """Return the pixels in a file that save_rendered wrote. Raises OSError."""
+    """Return the pixels in a file written by save_rendered. Raises OSError."""
     with np.load(path, allow_pickle=False) as arrays:
         return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in MATERIALS}

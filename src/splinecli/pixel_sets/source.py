@@ -16,16 +16,16 @@ from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
 from splinecli.synthesis.whole_capture import photograph_captures
 
-# Memory-mapped arrays are closed after this many bytes of them were read, so that their pages can be freed.
+# Memory-mapped arrays are closed after this many bytes have been read, so that their pages can be freed.
 _MAPPED_BYTES = 128 << 20
-# The operating system reads this much around the first byte of a page.
+# The operating system reads this many bytes when a page is first accessed.
 _READ_AHEAD_BYTES = 64 << 10
-FILL_ROUNDS = 3  # each round fills gaps one cell further from the cells with a light
+FILL_ROUNDS = 3  # each round extends one cell further from the cells with a light
 
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """The truth behind P pixels of a pixel set, under up to F lights each."""
+    """The ground truth of P pixels from a pixel set, under up to F lights each."""
 
     normals: Tensor  # (P, 3) unit normals
     radiance: Tensor  # (P, F)
@@ -45,11 +45,11 @@ class SampledPixels:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate cells between given cells. The result's `known` has the given cells, its `filled` all usable ones.
+    """Interpolate between given cells. The result's `known` marks the given cells, its `filled` all usable cells.
 
-    A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell whose
-    neighbours all lie on one side of it stays empty. Values and `known`, 1 in cells with an observation, else 0, are
-    (P, 1, w, w); `inside` (w, w) is 1 in the unit disc, outside of which cells stay empty.
+    In each of FILL_ROUNDS rounds, a cell without a value gets the weighted mean of its eight neighbours. A cell stays
+    empty if all its neighbours with a value are on one side. Values and `known`, 1 in cells with an observation, else
+    0, are (P, 1, w, w); `inside` (w, w) is 1 in the unit disc, outside of which cells stay empty.
     """
     near = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 0.0, 2.0], [1.0, 2.0, 1.0]])
     across = near * values.new_tensor([-1.0, 0.0, 1.0])
@@ -66,10 +66,10 @@ def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
 
 
 class PixelSetSource:
-    """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
+    """Draws pixels from some entries of a set, all with equal probability, under randomly chosen lights.
 
-    The lights of a pixel are drawn within a cone; see choose_in_cone. The pixels of a
-    capture, see CaptureConfig, are of one entry and have the same lights. Batches are on the device of the generator.
+    The lights are drawn within a cone; see choose_in_cone. All pixels of a capture (CaptureConfig) come from one entry
+    and have the same lights. Batches are on the device of the generator.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class PixelSetSource:
         return photograph_captures(truth, radiance, directions, valid, config, self.generator)
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return light indices (P, K) and which of them are used, from the number of each capture (G,)."""
+        """Return light indices (P, K) and a mask of the used ones, from the number of lights per capture (G,)."""
         captures = len(counts)
         rank = rank_in_cone(truth.light_directions[:captures], self.generator)
         order = rank.masked_fill(~truth.known[:captures], torch.inf).argsort(dim=1)[:, : int(counts.max())]
@@ -111,7 +111,7 @@ class PixelSetSource:
         flat = torch.randint(int(self._ends[-1]), (captures,), generator=self.generator, device=device).cpu()
         flat = flat.sort().values
         entry_of_pixel = torch.searchsorted(self._ends, flat, right=True)
-        if captures < pixels:  # An entry has the same probability as its pixels together.
+        if captures < pixels:  # Weight entries by their number of pixels.
             entry_of_pixel = entry_of_pixel.repeat(pixels // captures)
             counts = self._counts[entry_of_pixel]
             place = torch.rand(pixels, generator=self.generator, device=device, dtype=torch.float64).cpu()

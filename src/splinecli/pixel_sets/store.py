@@ -45,12 +45,12 @@ class Entry:
     """The description of an entry in the manifest."""
 
     name: str  # the folder of the entry, unique in its set
-    scene: str  # entries of one scene share their shape, so that all of them train or all of them validate
-    source: str  # where the pixels come from, for the user
-    recipe: dict[str, Any]  # plain values that decide the content of the entry
+    scene: str  # entries of one scene have the same shape, so they are all for training or all for validation
+    source: str  # description of where the pixels come from, for the user
+    recipe: dict[str, Any]  # plain values that determine the content of the entry
     n_pixels: int  # P
     n_lights: int  # F
-    sha256: dict[str, str]  # checksum of each array file by the name of the array
+    sha256: dict[str, str]  # checksum of each array file, by the name of the array
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class PixelSet:
         return [f"{entry.name}/{array}.npy" for entry in self.entries for array in ARRAYS]
 
     def load(self, entry: Entry) -> Pixels:
-        """Map the arrays of an entry into memory. Raises InputError if they are not what the manifest says."""
-        # As plain arrays, because slicing an np.memmap object takes ten times as long.
+        """Map the arrays of an entry into memory. Raises InputError if they do not match the manifest."""
+        # Convert to plain arrays, because slicing an np.memmap object takes ten times as long.
         pixels = Pixels(*(np.asarray(_map(self.folder / entry.name / f"{array}.npy")) for array in ARRAYS))
         _check_arrays(entry, pixels, self.folder)
         return pixels
@@ -131,7 +131,7 @@ def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
 
 
 def _problems(entry: Any) -> Iterator[str]:
-    # A file without a checksum would go unchecked.
+    # A file without a checksum would not be verified.
     if not all(isinstance(entry.sha256.get(array), str) for array in ARRAYS):
         yield "an entry is incomplete (a checksum is missing)"
     if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
@@ -148,7 +148,7 @@ def _check_checksums(entry: Entry, folder: Path) -> None:
     for array in ARRAYS:
         path, expected = folder / entry.name / f"{array}.npy", entry.sha256[array]
         mapped = _map(path)
-        # A file that is longer than its array is not read.
+        # A file longer than its array is rejected.
         is_whole = path.stat().st_size == mapped.offset + mapped.nbytes
         found = file_sha256(path)[:16] if is_whole else "another length"
         if found != expected[:16]:
@@ -178,7 +178,7 @@ def _map(path: Path) -> np.memmap[Any, Any]:
         raise _mismatch(path, "no plain file", "an array")
     try:
         return np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # a damaged header fails in a dozen ways
+    except Exception as error:  # a damaged header can raise a dozen types of errors
         if is_out_of_memory(error):
             raise
         raise _mismatch(path, "no array", "one") from error
@@ -195,14 +195,14 @@ def _mismatch(path: Path, found: str, expected: str) -> InputError:
 class PixelSetWriter:
     """Writes a new set, or adds entries to an existing one, finished or not.
 
-    The manifest never names an entry whose files change: it is written without it before, and with it after.
+    The manifest never lists an entry whose files are being changed: the entry is removed before and added afterwards.
     """
 
     def __init__(self, folder: Path) -> None:
         """Open the folder.
 
         Raises:
-            OutputError: the folder cannot be written, or has other files in it.
+            OutputError: the folder cannot be written, or contains other files.
             InputError: its manifest is damaged.
         """
         check_writable(folder)
@@ -231,7 +231,7 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Return in words the first setting in which an entry's recipe differs, with both values, or None."""
+        """Describe the first setting in which an entry's recipe differs, with both values; None if they are equal."""
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
             if asked.get(key) != found.get(key):
@@ -239,14 +239,14 @@ class PixelSetWriter:
         return None
 
     def describe(self, name: str) -> str:
-        """Return a line for the user about an entry of the set."""
+        """Return a one-line description of an entry for the user."""
         entry = self._entries[name]
         return f"{name}: {entry.n_pixels} pixels, {entry.n_lights} lights, {entry.source}"
 
     def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
-        """Write an entry of at least one pixel, in place of an earlier entry of that name.
+        """Write an entry of at least one pixel, replacing any earlier entry with the same name.
 
-        Raises OutputError if it cannot be written. The other entries are then as they were before.
+        Raises OutputError if it cannot be written. The other entries are not affected.
         """
         n_pixels, n_lights = pixels.observations.shape
         checksums = {}
@@ -277,6 +277,6 @@ class PixelSetWriter:
 
 
 def _plain(recipe: dict[str, Any]) -> dict[str, Any]:
-    """Return the recipe as it reads back from JSON."""
+    """Return the recipe as read back from JSON."""
     plain: dict[str, Any] = json.loads(json.dumps(recipe))
     return plain

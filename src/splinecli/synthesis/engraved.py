@@ -1,6 +1,6 @@
 """Plates and half ellipsoids, smooth or with detail of a few pixels, such as engraved, woven or faceted surfaces.
 
-Rendered scenes have few bends of a pixel's size. These pieces have, but no cast shadows or interreflection.
+Rendered scenes have little pixel-scale curvature. These pieces do, but without cast shadows or interreflection.
 """
 
 import math
@@ -21,14 +21,14 @@ def draw_engraved(
 
     `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the
     frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has
-    one kind of detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20
-    pixels; or a random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a
-    third of it for the texture. A third of the pieces are smooth. The material is that of draw_material, with 1 to 300
-    patches; in half of the pieces these differ in their base alone. The lights (F, 3) are unit.
+    one kind of detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or curved; facets of 3 to
+    20 pixels; or a random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6),
+    a third as large for the texture. A third of the pieces are smooth. The material comes from draw_material, with 1 to
+    300 patches; in half of the pieces, the patches differ only in their base colour. The lights (F, 3) are unit.
     """
     uniform = partial(draw_number, generator)
     normals, mask = _draw_base(size, round_share, generator)
-    # A third of the pieces has no detail: smooth things must stay smooth, whatever they are made of.
+    # A third of the pieces have no detail, because smooth surfaces must stay smooth whatever their material.
     if uniform() >= 1 / 3:
         detail = _draw_detail(size, generator)
         normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
@@ -89,7 +89,7 @@ def _draw_detail(size: int, generator: torch.Generator) -> Tensor:
 
 
 def _places(size: int) -> Tensor:
-    """Return the places (size^2, 2) of the pixels, y up."""
+    """Return the positions (size^2, 2) of the pixels, y up."""
     rows, columns = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
     return torch.stack((columns, -rows), dim=-1).view(-1, 2)
 

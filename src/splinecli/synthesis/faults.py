@@ -1,7 +1,7 @@
 """Faults of a capture: exposure, noise, quantisation, and errors of calibration, as random draws for each pixel.
 
-They change the sparse observations alone; the dense map is the truth. Each function states the distribution that it
-draws from. Observations are linear, and 1 is the sensor's full scale.
+They change only the sparse observations; the dense map stays the ground truth. Each function documents the distribution
+it draws from. Observations are linear, and 1 is the sensor's full scale.
 """
 
 import math
@@ -15,15 +15,15 @@ from splinecli.restoration.images import restore_saturated
 from splinecli.synthesis.random_numbers import draw_uniform
 
 DARK_SHARE = 0.4
-"""Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
+"""Share of the pixels that are dark compared with the brightest in their capture, which determines the exposure."""
 
-BITS = (10, 12, 14, 16)  # depths of the pixels that do not have 8 bits, equally often
+BITS = (10, 12, 14, 16)  # bit depths of the pixels that do not have 8 bits, equally likely
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Add Gaussian errors of calibration to the directions (P, F, 3) of a share of the pixels.
+    """Add Gaussian calibration errors to the directions (P, F, 3) of a share of the pixels.
 
-    Their sigma on either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
+    Their sigma along either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
     """
     pixels = len(directions)
     sigma = math.radians(8.0) * draw_uniform(generator, pixels, 1, 1) ** 3
@@ -34,7 +34,7 @@ def disturb_light_directions(directions: Tensor, share: float, generator: torch.
 
 
 def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Multiply observations (P, F) by Gaussian errors of intensity, sigma U(0, 5 %), for a share of the pixels."""
+    """Multiply observations (P, F) by Gaussian intensity errors, sigma U(0, 5 %), for a share of the pixels."""
     sigma = draw_uniform(generator, len(observations), 1, high=0.05) * (
         draw_uniform(generator, len(observations), 1) < share
     )
@@ -45,7 +45,7 @@ def disturb_light_intensities(observations: Tensor, share: float, generator: tor
 def draw_light_intensities(pixels: int, lights: int, share: float, generator: torch.Generator) -> Tensor:
     """Draw relative light intensities (P, F), the largest 1; for a share of the pixels 2^U(-2, 0), else equal ones.
 
-    A capture is exposed as its lamps are, and divided by their intensities afterwards: the observations of a weak lamp
+    Images are taken with unequal lamps and divided by the intensities afterwards, so the observations under a weak lamp
     have coarser steps and more noise.
     """
     unequal = draw_uniform(generator, pixels, 1) < share
@@ -56,8 +56,8 @@ def draw_light_intensities(pixels: int, lights: int, share: float, generator: to
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
     """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
 
-    The brightest observation of a pixel lies at 10^U(-2.7, -0.7) for DARK_SHARE of the pixels, else at 10^U(-1.3, 0).
-    For `saturated_share` of the pixels it lies at U(1, 3), to be clipped.
+    The brightest observation of a pixel is 10^U(-2.7, -0.7) for DARK_SHARE of the pixels, else 10^U(-1.3, 0). For
+    `saturated_share` of the pixels it is U(1, 3), and is clipped later.
     """
     pixels = len(radiance)
     dark = draw_uniform(generator, pixels, 1) < DARK_SHARE
@@ -71,7 +71,7 @@ def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Gen
 def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
     """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both Gaussian.
 
-    The read noise is at most a thirtieth of a pixel's largest observation: few keep a capture that is darker than that.
+    The read noise is at most a thirtieth of a pixel's largest observation, because darker captures are rarely kept.
     """
     pixels = len(exposed)
     read = 10 ** draw_uniform(generator, pixels, 1, low=-4.0, high=-2.5)
@@ -85,8 +85,8 @@ def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
 def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
     """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to one of BITS.
 
-    Half of the pixels with 8 bits are encoded by the curve of sRGB, rounded and decoded again. Of the others, half are
-    rounded, and half are cut, as where somebody keeps the high byte of 16.
+    Half of the 8-bit pixels are encoded with the sRGB curve, rounded and decoded again. Of the others, half are rounded
+    and half truncated, as when only the high byte of 16 bits is kept.
     """
     pixels = len(exposed)
     eight = draw_uniform(generator, pixels, 1) < eight_bit_share
@@ -97,7 +97,7 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     steps = torch.where(eight, 255.0, 2.0**depth - 1).to(exposed.dtype)
     rounded = (exposed * steps).round() / steps
     cut = (exposed * 256).floor().clamp(max=255) / 255
-    # The linear values of the 256 levels, and the borders between them.
+    # The linear values of the 256 levels, and the thresholds between adjacent levels.
     stored = np.linspace(0, 1, 511, dtype=np.float32)
     linear = torch.from_numpy(decode_transfer(stored, None)).to(exposed)
     encoded = linear[::2][torch.bucketize(exposed.contiguous(), linear[1::2].contiguous())]
@@ -107,14 +107,14 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
 def restore(observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
     """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full scale.
 
-    All are (P, F), the directions (P, F, 3), unit. Observations that are not valid are left out.
+    All arrays are (P, F), except the unit directions (P, F, 3). Invalid observations are ignored.
     """
     chosen = (draw_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
     rows = chosen.nonzero()[:, 0]
     if not len(rows):
         return observed
     values = observed[rows].cpu().numpy()
-    # An observation that is not valid is dark, so it hardly counts in the fit.
+    # Invalid observations are dark, so they hardly affect the fit.
     lights = (directions[rows] * valid[rows, :, None]).cpu().numpy()
     restore_saturated(values, clipped[rows].cpu().numpy(), lights.__getitem__)
     return observed.index_copy(0, rows, torch.from_numpy(values).to(observed))

@@ -1,4 +1,4 @@
-"""Random light rigs: the number of lights of a pixel and their directions."""
+"""Random light rigs: the number of lights per pixel and their directions."""
 
 import math
 from collections.abc import Mapping
@@ -12,8 +12,8 @@ from splinecli.synthesis.random_numbers import draw_uniform
 def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:
     """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
 
-    Each draw has a largest number. For half of the draws it is usual - 1 to usual + 2, else it is log-uniform over
-    low..high. The pixels have four fifths of that number or more, which saves padding.
+    Each draw has a maximum: for half of the draws it is usual - 1 to usual + 2, else it is log-uniform over low..high.
+    Every pixel has at least four fifths of that number, which keeps the padding small.
     """
     anywhere = low * ((high + 1) / low) ** draw_uniform(generator, 1)
     about = usual - 1 + 4 * draw_uniform(generator, 1)
@@ -31,7 +31,7 @@ def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -
 
 
 def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
-    """Return ranks (P, F) of the lights (P, F, 3) of P pixels, whose lowest are chosen; see choose_in_cone."""
+    """Return ranks (P, F) of the lights (P, F, 3) of P pixels; the lowest ranks are chosen, see choose_in_cone."""
     uniform = draw_uniform(generator, *directions.shape[:2])
     half_angle = _uniform_deg(generator, len(directions), 1, low=20, high=90)
     z = directions[..., 2]
@@ -49,8 +49,8 @@ def draw_light_directions(
 ) -> Tensor:
     """Draw unit light directions (P, F, 3), a rig for each pixel.
 
-    A rig is a set of points in the (x, y) disc. It is turned about the view axis at random, and points outside 0.996
-    of the disc are moved to its rim.
+    A rig is a set of points in the (x, y) disc. It is rotated about the view axis at random, and points beyond a radius
+    of 0.996 are moved to the rim of the disc.
     """
     kind = torch.multinomial(
         torch.tensor([shares.get(name, 0.0) for name in _RIGS], device=generator.device),
@@ -73,8 +73,8 @@ def draw_light_directions(
 def _draw_ellipse(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Fill an ellipse uniformly, by projected area.
 
-    One half-axis is sin U(20, 88) degrees, the other U(0.5, 1) of it. The centre of half of the rigs is moved by up to
-    0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp above.
+    One half-axis is sin U(20, 88) degrees, and the other is U(0.5, 1) times as long. Half of the rigs are off-centre by
+    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp above.
     """
     x, y = _in_disc(pixels, lights, generator)
     major = _uniform_deg(generator, pixels, 1, low=20, high=88).sin()
@@ -94,7 +94,7 @@ def _draw_cone(pixels: int, lights: int, generator: torch.Generator) -> Points:
 def _draw_ring(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Place lights evenly at one angle of U(15, 75) degrees from the view axis, within 2 degrees (sigma).
 
-    Half of the rings are whole, the others arcs of U(120, 360) degrees. The azimuths have a sigma of 10 degrees.
+    Half of the rings are complete, the others are arcs of U(120, 360) degrees. The azimuths have a sigma of 10 degrees.
     """
     arc = _uniform_deg(generator, pixels, 1, low=120, high=360)
     arc = torch.where(draw_uniform(generator, pixels, 1) < 0.5, 2 * math.pi, arc)
@@ -106,7 +106,7 @@ def _draw_ring(pixels: int, lights: int, generator: torch.Generator) -> Points:
 def _draw_line(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Place lights on a line of half-length sin U(30, 85) degrees, at up to 0.5 from the view axis.
 
-    They are off the line by a sigma of sin U(1, 10) degrees, so that they lie nearly in one plane.
+    They deviate from the line with a sigma of sin U(1, 10) degrees, so they are nearly coplanar.
     """
     x = draw_uniform(generator, pixels, lights, low=-1) * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
     sigma = _uniform_deg(generator, pixels, 1, low=1, high=10).sin()
@@ -116,7 +116,7 @@ def _draw_line(pixels: int, lights: int, generator: torch.Generator) -> Points:
 def _draw_hand_held(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Place lights in clusters, 20 to 70 degrees from the view axis, in a sector of U(90, 360) degrees.
 
-    A cluster has U(1, 5) lights on average. They have a sigma of 6 degrees on either angle.
+    A cluster has U(1, 5) lights on average. They spread with a sigma of 6 degrees in either angle.
     """
     clusters = (lights / draw_uniform(generator, pixels, 1, low=1, high=5)).clamp(min=1)
     member = torch.arange(lights, device=generator.device).remainder(clusters).long()
@@ -154,7 +154,7 @@ def _near(
     shape = len(polar), lights
     polar = polar + math.radians(polar_sigma_deg) * _normal(generator, *shape)
     azimuth = azimuth + math.radians(azimuth_sigma_deg) * _normal(generator, *shape)
-    # Beyond the horizon, the sine would bring a light back into the disc.
+    # Beyond the horizon, the sine would move a light back into the disc.
     radius = polar.clamp(max=math.pi / 2).sin()
     return radius * azimuth.cos(), radius * azimuth.sin()
 

@@ -1,9 +1,9 @@
-"""Triangle meshes in the frame of the camera: x right, y up, z to the camera. It sees the square [-1, 1]^2.
+"""Triangle meshes in the camera frame: x right, y up, z to the camera, whose view is the square [-1, 1]^2.
 
-They are read from files, or are surfaces of approximate signed distance fields. A field is a function of points (N, 3).
-It is negative inside the shape and grows at about unit rate across its surface. Smooth union: Quilez, "Smooth minimum"
+They are read from files, or extracted from approximate signed distance fields. A field is a function of points (N, 3),
+negative inside the shape, that grows at about unit rate across the surface. Smooth union: Quilez, "Smooth minimum"
 (https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et al. 2003); the vertices are then moved onto
-the zero of the field, and its gradient gives their normals.
+the zero level set, and the gradient of the field gives their normals.
 """
 
 import io
@@ -25,7 +25,7 @@ REACH = 0.94  # half-width of the object in the camera's square
 LONGEST_EDGE = 0.03  # of a face; longer ones are split
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
-"""Bytes of a file of each format. A byte of the first three may give a triangle, of 110 bytes in memory."""
+"""Largest file size by format, in bytes. In the first three, one byte may give a triangle of 110 bytes in memory."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Mesh:
     """A triangle mesh."""
 
     vertices: Floats  # (V, 3) float32
-    faces: NDArray[np.int32]  # (T, 3) int32, rows of vertices, anticlockwise as seen from outside
+    faces: NDArray[np.int32]  # (T, 3) int32, indices of vertices, anticlockwise as seen from outside
     vertex_normals: Floats  # (V, 3) float32, unit, outward; shading interpolates them
 
 
@@ -42,14 +42,14 @@ def read_mesh(path: str | Path) -> Mesh:
 
     The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
     angle. Long edges are split, so that every part of the surface has vertices and can have its own material. Raises
-    InputError if the file is missing, too long, not a mesh, or has no faces.
+    InputError if the file is missing, too large, not a mesh, or has no faces.
     """
     import trimesh
 
     check_file(path := Path(path), "a mesh")
     try:
         kind, content = _read_known(path)
-        # From its content, so that no file that it names is read.
+        # Parse the content only, so that files it refers to are not read.
         with np.errstate(all="ignore"):  # it checks the normals of an STL file
             loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
         if (count := len(loaded.faces)) > MOST_FACES:
@@ -58,19 +58,19 @@ def read_mesh(path: str | Path) -> Mesh:
         if count:
             with np.errstate(all="ignore"):
                 size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-            if not 0 < size < np.inf:  # NaN, too. process() would remove triangles with such corners
+            if not 0 < size < np.inf:  # also catches NaN; process() would remove triangles with such corners
                 raise InputError("the corners are not finite numbers, or all in one place", path=path)
-            loaded.vertices = loaded.vertices / size  # trimesh merges corners that are nearer than 1e-8
+            loaded.vertices = loaded.vertices / size  # trimesh merges corners closer than 1e-8
         loaded.process()
         # Texture coordinates split vertices, and would split the smooth normals too.
         loaded.merge_vertices(merge_tex=True, merge_norm=True)
         if len(loaded.faces) and loaded.is_watertight and loaded.volume < 0:
-            loaded.invert()  # the mesh is inside out, so the camera would see nothing
+            loaded.invert()  # the mesh is inside out, so nothing would face the camera
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
         normals = np.asarray(loaded.vertex_normals) if len(faces) else np.zeros((0, 3))
     except InputError:
         raise
-    except Exception as error:  # the readers raise many kinds
+    except Exception as error:  # the readers raise many types
         if is_out_of_memory(error):
             raise
         raise InputError(
@@ -87,9 +87,9 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def _read_known(path: Path) -> tuple[str, bytes]:
-    """Return the format of a mesh file, by its content, and its content.
+    """Return the format of a mesh file, detected from its content, and that content.
 
-    Raises InputError if it is of another format or too long, or OSError if it cannot be read.
+    Raises InputError if the format is not supported or the file too large, or OSError if it cannot be read.
     """
     with path.open("rb") as file:
         content = file.read(max(_LONGEST.values()) + 1)
@@ -195,7 +195,7 @@ def smooth_union(first: Floats, second: Floats, blend: float) -> Floats:
 
 
 def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
-    """Return the distance to a shape after another one was cut out of it."""
+    """Return the distance to a shape after another shape was subtracted."""
     return -smooth_union(-shape, tool, blend)
 
 
@@ -219,7 +219,7 @@ def waves(rng: np.random.Generator, frequency: float, outputs: int = 1) -> Field
 
 
 def ridges(rng: np.random.Generator, frequency: float) -> Field:
-    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| of two octaves, one half as high."""
+    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| in two octaves, one half as high."""
     low, high = waves(rng, frequency), waves(rng, 2 * frequency)
 
     def value(points: Floats) -> Floats:
@@ -246,11 +246,11 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     if not values.min() < 0 < values.max():
         return None
     measure = import_extra("skimage.measure", "render")
-    # The corners of a face run anticlockwise as seen from where the values are above 0, which is outside.
+    # The corners of a face run anticlockwise as seen from the side with values above 0, which is outside.
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
     vertices, faces = _largest_part(vertices, faces)
-    # Make one step of Newton's method, because linear interpolation between samples leaves terraces.
+    # Take one Newton step, because linear interpolation between samples leaves terraces.
     slope = gradient(field, vertices)
     squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
     move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
@@ -259,7 +259,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
-COARSE = 4  # Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely.
+COARSE = 4  # Samples along the edge of a coarse cell. Cells far from the surface are not sampled at full resolution.
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
@@ -277,7 +277,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
     shape = tuple(len(axis) for axis in axes)
     values = np.ascontiguousarray(far[: shape[0], : shape[1], : shape[2]])
     exact = np.zeros(shape, dtype=bool)
-    # The upper faces of a cell belong to it, too.
+    # The upper faces are part of the cell, too.
     for x, y, z in np.ndindex(2, 2, 2):
         exact[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]] |= close
     at = exact.nonzero()
@@ -287,7 +287,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
 
 def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
-    # Evaluate pieces that fit into the processor's cache.
+    # Evaluate in pieces that fit into the processor's cache.
     pieces = [field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
 

@@ -1,7 +1,7 @@
 """The camera between the object and the files: lens, Bayer pattern, sharpening and JPEG, and translucent materials.
 
-They mix neighbouring pixels, so they act on whole images (F, H, W) of linear radiance with their background. Each draw
-states its distribution. The faults that each pixel has on its own are in faults.py.
+These effects mix neighbouring pixels, so they act on whole images (F, H, W) of linear radiance, background included.
+Each draw documents its distribution. Faults that affect each pixel separately are in faults.py.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ class Optics:
 
     kernels: Tensor  # (3, k, k), the blur of red, green and blue, each with the sum 1
     weights: tuple[float, float, float]  # of red, green and blue in the gray value, with the sum 1
-    demosaic: int | None  # OpenCV's code of the interpolation of the Bayer pattern; None for a sensor without one
+    demosaic: int | None  # OpenCV's code for the Bayer interpolation; None for a sensor without a Bayer pattern
     sharpening: float  # amount of the unsharp mask, 0 for none
     sharpening_sigma: float  # its width in pixels
     jpeg_quality: int | None  # None for no JPEG
 
     def through_lens(self, images: Tensor) -> Tensor:
-        """Return what arrives at the sensor as red, green and blue, (3, F, H, W), from radiance (F, H, W)."""
+        """Return the red, green and blue irradiance on the sensor (3, F, H, W) for radiance (F, H, W)."""
         return torch.stack([_blurred(images, kernel) for kernel in self.kernels])
 
     def develop(self, colours: Tensor) -> Tensor:
-        """Return the gray images (F, H, W), 0 to 1, from the sensor's exposure (3, F, H, W), 0 to 1, with its noise."""
+        """Return the gray images (F, H, W), 0 to 1, from the noisy sensor exposure (3, F, H, W), 0 to 1."""
         if self.demosaic is not None:
             colours = _interpolated(colours, self.demosaic)
         gray = torch.einsum("c,cfhw->fhw", torch.tensor(self.weights), colours)
@@ -49,7 +49,7 @@ class Optics:
         return gray.clamp(0, 1)
 
     def compress(self, images: Tensor) -> Tensor:
-        """Return the linear values of images (F, H, W), 0 to 1, after JPEG with the curve of sRGB."""
+        """Return the linear values of images (F, H, W), 0 to 1, after JPEG compression with the sRGB curve."""
         if self.jpeg_quality is None:
             return images
         encoded = encode_srgb(images.numpy())
@@ -63,10 +63,10 @@ def draw_optics(generator: torch.Generator) -> Optics:
     """Draw a camera.
 
     Blur: none in 15 % of the captures, else with a standard deviation of U(0, 1.2) pixels, a Gaussian or, in a third,
-    the disc of defocus. The widths of red, green and blue differ by U(-8, 8) % each. Bayer pattern: in half,
-    interpolated bilinearly in half of these, else along edges. Colour of the object and weights of gray: U(0.2, 1) for
-    each of red, green and blue together. Sharpening: in 20 %, an unsharp mask of U(0.2, 1) with a sigma of U(0.6, 1.5)
-    pixels. JPEG, for captures of 8 bits: in a third, of quality U(75, 98).
+    the disc of defocus. The widths of red, green and blue differ by U(-8, 8) % each. Bayer pattern: in half of
+    the captures, of which half are interpolated bilinearly, the others along edges. Object colour and gray weights,
+    combined: U(0.2, 1) for each of red, green and blue. Sharpening: in 20 %, an unsharp mask of U(0.2, 1) with a sigma
+    of U(0.6, 1.5) pixels. JPEG, for 8-bit captures: in a third, with a quality of U(75, 98).
     """
     uniform = partial(draw_number, generator)
     sigma = uniform(0, 1.2) * (uniform() >= 0.15)
@@ -108,8 +108,8 @@ def disc_kernel(sigma: float) -> Tensor:
 def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
     """Return radiance (F, H, W) of an object (H, W) whose material scatters light below its surface.
 
-    U(0.3, 1) of the light leaves the surface at a distance from where it arrives: a Gaussian with a sigma of U(1, 4)
-    pixels. None leaves the object.
+    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry: a Gaussian with a sigma of
+    U(1, 4) pixels. Light does not scatter out of the object.
     """
     share, kernel = draw_number(generator, 0.3, 1), gaussian_kernel(draw_number(generator, 1, 4))
     inside = mask[None].float()
@@ -118,7 +118,7 @@ def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
-    """Return images (F, H, W), convolved with a kernel (k, k); beyond the border they go on as at the border."""
+    """Return images (F, H, W), convolved with a kernel (k, k); the border values are extended outwards."""
     if len(kernel) == 1:
         return images
     reach = len(kernel) // 2

@@ -1,8 +1,8 @@
-"""The online pixel generator: it makes training pixels in batches, on the device of its random generator.
+"""The online pixel generator, which makes batches of training pixels on the device of its random generator.
 
-Each pixel has its own normal and walls, and a material of its own or of its capture. It gives its radiance under any
-light. A random rig gives the sparse observations, and the directions of all cells give the complete dense map. PX-Net
-(Logothetis et al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
+Each pixel has its own normal and walls, and either its own material or that shared by its capture. Its radiance can be
+computed under any light: a random rig gives the sparse observations, and the directions of all cells give the complete
+dense map. PX-Net (Logothetis et al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from splinecli.synthesis.whole_capture import photograph_captures
 
 @dataclass(frozen=True)
 class Wall:
-    """A surface beside each pixel that hides a sector of low lights and reflects the others.
+    """A surface beside each pixel that blocks a sector of low lights and reflects the others.
 
     A pixel without a wall has tan_height = reflectance = 0.
     """
@@ -43,8 +43,8 @@ class Wall:
     def visibility(self, directions: Tensor) -> Tensor:
         """Return the share of each light that passes the wall (P, D): a cast shadow over one sector of the map.
 
-        A direction is hidden where its elevation is under the wall's, l_z < tan(height) l_along, and it falls
-        within the wall's width, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
+        A direction is blocked if its elevation is below the top of the wall, l_z < tan(height) l_along, and it is
+        within the width of the wall, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
         """
         along = dot(self.azimuth, directions)
         quarter_turn = torch.stack((-self.azimuth[:, 1], self.azimuth[:, 0], self.azimuth[:, 2]), dim=-1)
@@ -53,10 +53,10 @@ class Wall:
         return 1 - (depth / self.softness).clamp(0, 1)
 
     def reflected(self, normals: Tensor, material: PrincipledMaterial, directions: Tensor) -> Tensor:
-        """Return the radiance (P, D) that light from the wall adds to pixels of these normals (P, 3) and material.
+        """Return the radiance (P, D) that light from the wall adds to pixels with these normals (P, 3) and material.
 
-        The reflected light comes from one direction, `towards`. On a metal it makes a highlight. Real walls and
-        reflections are wide, so neither may reflect more than three times what matte white would.
+        The reflected light comes from one direction, `towards`, and causes a highlight on metal. Real walls and
+        reflections are extended, so both are limited to three times the reflection of a matte white surface.
         """
         returned = directions.new_zeros(len(normals), directions.shape[-2])
         facing_cosine = -dot(self.facing, self.towards[:, None])
@@ -78,7 +78,7 @@ class Wall:
         return returned
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Wall:
-        """Turn the wall about the view axis."""
+        """Rotate the wall about the view axis."""
         vectors = {"azimuth": self.azimuth, "facing": self.facing, "towards": self.towards}
         return replace(self, **{name: rotate_about_view_axis(each, cosine, sine) for name, each in vectors.items()})
 
@@ -91,12 +91,12 @@ def draw_wall(
     shadows: bool = True,
     interreflections: bool = True,
 ) -> Wall:
-    """Draw walls for a share of the pixels with these normals (P, 3); a tensor (P, 1) has a share for each.
+    """Draw walls for a share of the pixels with these normals (P, 3); a tensor (P, 1) gives a share per pixel.
 
-    azimuth: within N(0, 50 degrees) of the normal's for 60 %, because a surface in a hollow faces a wall; else uniform.
+    azimuth: N(0, 50 degrees) from the normal's for 60 %, because a surface in a hollow faces a wall; else uniform.
     height: U(8, 75) degrees. half-width: tan U(15, 88) degrees. softness: U(0.01, 0.06).
     facing: the wall leans back by U(0, 60) degrees from upright.
-    towards: at U(0.2, 0.9) of the height, where the wall faces the pixel.
+    towards: at U(0.2, 0.9) of the height, on the side that faces the pixel.
     reflectance: (1 - cos(height)) U(0, 1) U(0.5, 2). Half of the walls have the pixel's material. The others are
     matte, with an albedo of U(0.05, 0.9).
     """
@@ -118,7 +118,7 @@ def draw_wall(
     elevation = torch.minimum(height * uniform(low=0.2, high=0.9), math.radians(85) - lean)
     return Wall(
         azimuth=toward,
-        # Without shadows the wall lies below every light but still reflects.
+        # Without shadows the wall is lower than every light but still reflects.
         tan_height=height.tan() if shadows else torch.zeros_like(height),
         tan_half_width=half_width.tan(),
         softness=uniform(low=0.01, high=0.06),
@@ -137,7 +137,7 @@ def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tenso
 
 @dataclass(frozen=True)
 class PixelGeneratorConfig(CaptureConfig):
-    """Switches and shares of the pixel generator and of its captures. A share of 0 switches an effect off."""
+    """Switches and shares of the pixel generator and its captures. A share of 0 disables an effect."""
 
     cast_shadows: bool = True
     interreflections: bool = True
@@ -148,7 +148,7 @@ class PixelGeneratorConfig(CaptureConfig):
 
 @dataclass(frozen=True)
 class PixelScene:
-    """P pixels seen from +z. `mixed` is a second surface of the first M pixels: an edge, or a second material."""
+    """P pixels viewed from +z. `mixed` is a second surface in the first M pixels: an edge, or a second material."""
 
     normals: Tensor
     material: PrincipledMaterial
@@ -158,7 +158,7 @@ class PixelScene:
     mixed_weight: Tensor | None = None
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white that faces its light has 1."""
+        """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white facing the light gives 1."""
         visible = torch.ones((), device=self.normals.device)
         returned = self.material.albedo() * self.ambient
         for wall in self.walls:
@@ -176,7 +176,7 @@ class PixelScene:
         return total
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> PixelScene:
-        """Turn each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
+        """Rotate each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
         mixed = self.mixed
         if mixed is not None:
             mixed = mixed.rotate(cosine[: len(mixed.normals)], sine[: len(mixed.normals)])
@@ -184,7 +184,7 @@ class PixelScene:
         return replace(self, normals=rotate_about_view_axis(self.normals, cosine, sine), walls=walls, mixed=mixed)
 
     def dense_truth(self, size: int = MAP_SIZE) -> DenseMap:
-        """Return the complete maps: radiance at the cells' centres, known in the whole disc."""
+        """Return the complete maps: radiance at the cell centres, known in the whole disc."""
         directions, inside = (part.to(self.normals.device) for part in cell_directions(size))
         dense = self.normals.new_zeros(len(self.normals), 1, size, size)
         dense[:, 0, inside] = self.radiance(directions[inside])
@@ -207,10 +207,10 @@ def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tenso
 
 
 def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
-    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials.
+    """Draw random pixels. Half of the mixed pixels are on an edge, with a second normal; half blend two materials.
 
-    Pixel p belongs to capture p % G, see CaptureConfig. The pixels of a capture share their materials, see
-    draw_shared_materials, and how many of them have walls: the usual share times U(-0.7, 2.3), none where that is
+    Pixel p belongs to capture p % G (CaptureConfig). All pixels of a capture share their materials
+    (draw_shared_materials) and the probability of a wall: the usual share times U(-0.7, 2.3), or zero if that is
     negative, as on convex objects.
     """
     normals = draw_visible_normals(pixels, generator)
@@ -219,7 +219,7 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         hollow: float | Tensor = 1.0
         ambient_share = config.ambient_share
     else:
-        ambient_share = 0.0  # photograph_scene adds what the pixels of a capture share
+        ambient_share = 0.0  # photograph_scene adds the ambient light that all pixels of a capture share
         captures = config.captures(pixels)
         material = draw_shared_materials(pixels, captures, generator)
         hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)
@@ -250,8 +250,8 @@ _MOST_MATERIALS = 8
 def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator) -> PrincipledMaterial:
     """Draw the materials of some pixels; pixel p belongs to capture p % captures.
 
-    60 % of the captures have one material, the others 2 to 8. In half, these differ in their base alone, as on a
-    painted or printed object of one gloss.
+    60 % of the captures have one material, the others 2 to 8. In half of the captures, the materials differ only in
+    their base colour, as on a painted or printed object of uniform gloss.
     """
     drawn = draw_material(captures * _MOST_MATERIALS, generator)
     count = 2 + ((_MOST_MATERIALS - 1) * draw_uniform(generator, captures)).long()

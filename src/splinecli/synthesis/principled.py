@@ -1,10 +1,10 @@
-"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels seen from +z.
+"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels viewed from +z.
 
 The BRDF is isotropic and gray. A pixel's observation is the mean of its colour channels, and the model is nearly
 linear in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
 
-As in Disney's own later code, Smith's shadowing takes the roughness as it is, without the remapping of 2012;
-and the lobe is never narrower than at roughness 0.1, which float32 still resolves.
+As in Disney's own later code, Smith's shadowing uses the roughness directly, without the remapping of 2012. The lobe is
+never narrower than at roughness 0.1, which float32 still resolves.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from torch import Tensor
 from splinecli.synthesis.random_numbers import draw_uniform
 
 _SHINY, _METAL, _HALF_METAL = 0.30, 0.58, 0.86
-"""A uniform number selects the kind of a material: matte below the first, then as named."""
+"""Thresholds on the uniform number that selects the kind of material: matte below the first, then as named."""
 
 CLASSES = {"diffuse": (0.0, _SHINY), "specular": (_SHINY, _METAL), "metallic": (_METAL, 1.0)}
-"""Classes of materials of the rendered scenes, and the range of the number that selects the kind."""
+"""Material classes of the rendered scenes, and the range of the number that selects the kind."""
 
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
     """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in CyclesPS.
 
-    The last six are not Burley's.
+    The last six are additions to Burley's model.
     """
 
     base: Tensor
@@ -38,31 +38,31 @@ class PrincipledMaterial:
     sheen: Tensor
     clearcoat: Tensor
     clearcoat_gloss: Tensor
-    # where above 0, the diffuse light loses this share at grazing angles, on its way in and on its way out, as through
-    # the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
+    # If above 0, the diffuse light loses this share at grazing angles, both entering and leaving, as through the
+    # smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
     interface_loss: Tensor
-    # kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): under 1 it is flat as on dust,
-    # over 1 steep as on marble.
+    # kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): below 1 the falloff is
+    # flat as on dust, above 1 steep as on marble.
     minnaert: Tensor
     # gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is GGX; smaller
     # values give longer tails.
     tail_exponent: Tensor
     second_share: Tensor  # share of the facets that form a second highlight, such as the flakes of a metallic paint
-    second_roughness: Tensor  # the roughness of these facets
+    second_roughness: Tensor  # the roughness of the second set of facets
     retro: Tensor  # a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
-        """Return the materials of some of the pixels. An index tensor may name a pixel several times."""
+        """Return the materials of some of the pixels. An index tensor may repeat pixels."""
         return PrincipledMaterial(*(getattr(self, field.name)[pixels] for field in fields(self)))
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
         """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P, D).
 
-        The cosines of normal and light (P, D) are negative in attached shadow, where radiance is zero. Those of normal
-        and viewing direction (P, 1) are positive; those of light and viewing direction are (D) or (P, D).
+        n_dot_l (P, D) is negative in attached shadow, where radiance is zero. n_dot_v (P, 1) is positive. l_dot_v is
+        (D) or (P, D).
         """
         lit = n_dot_l.clamp(min=0)
-        # Light from behind the surface has no half vector. Rounding would make it NaN.
+        # Light from behind the surface has no half vector, and rounding would give NaN.
         l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
         n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
         n_dot_h_squared = n_dot_h * n_dot_h
@@ -114,19 +114,19 @@ def draw_material(
 ) -> PrincipledMaterial:
     """Draw random materials: 30 % matte, 28 % specular, 28 % metallic, 14 % half metallic.
 
-    base: U(0.05, 1); 10^U(-1.7, 0) for half of what is no metal, because many real surfaces are dark.
+    base: U(0.05, 1); 10^U(-1.7, 0) for half of the non-metals, because many real surfaces are dark.
     roughness: U(0.05, 1); U(0.1, 0.9) for metals.
     specular: U(0, 1); U(1, 4) for half of the specular class.
-    metallic: 0, 1 or U(0, 1): between them lie metallic paints and gilding with a patina.
+    metallic: 0, 1 or U(0, 1); intermediate values model metallic paints and gilding with a patina.
     sheen: U(0, 1) on a fifth of the dielectrics.
     clearcoat: U(0, 1) on 10 %, and U(1, 4), a full coat of lacquer, on 15 %; gloss U(0, 1).
     interface_loss: U(0, 1) on 60 %. minnaert: U(0.85, 1.5) on 70 %. tail_exponent: U(1.1, 2) on 50 %.
     second_share: U(0, 0.7) on 40 % of the metals and half metals and on 15 % of the others; second_roughness:
     U(0.1, 0.8).
-    retro: 10^U(-1.3, 0) on 8 % of what is no metal.
+    retro: 10^U(-1.3, 0) on 8 % of the non-metals.
 
-    MERL's measured materials fall faster than by the cosine: as (n.l)^1.14 in the median of those that are no metal,
-    nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.
+    The measured MERL materials fall off faster than the cosine: the median exponent of n.l over the non-metals is 1.14,
+    and nine tenths are between 0.86 and 1.47. The ranges of base and minnaert were chosen to approximate this.
 
     Args:
         kinds: the range of the uniform number that selects the kind.
@@ -160,16 +160,16 @@ def draw_material(
 
 
 def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Give all rows the material of the first but for their base, as of a painted or printed object.
+    """Give all rows the material of the first except for the base, as on a painted or printed object.
 
-    A metal may then have the dark base of another kind, as where it has tarnished.
+    A metal may then have the dark base of another kind, as if tarnished.
     """
     first = material.take(torch.zeros(len(material.base), dtype=torch.long, device=material.base.device))
     return replace(first, base=material.base)
 
 
 def _facets(n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor) -> Tensor:
-    """Return the facets' distribution times their shadowing; GGX where the tail exponent is 2."""
+    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is 2."""
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
     if bool((tail_exponent < 2).any()):

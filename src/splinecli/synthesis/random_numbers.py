@@ -1,4 +1,4 @@
-"""Random numbers of a range, from a generator, and the seeds of generators."""
+"""Uniform random numbers from a generator, and the seeds of generators."""
 
 import numpy as np
 import torch
@@ -16,9 +16,9 @@ def draw_number(generator: torch.Generator, low: float = 0.0, high: float = 1.0)
 
 
 def stream_seed(*numbers: int) -> int:
-    """Return the seed of one of many random streams, such as that of a run's seed, a step and the step's stream.
+    """Return the seed of a random stream from its numbers, such as the run's seed, the step and the stream index.
 
-    What a step draws depends on these numbers alone. A resumed run, or one that is shared among processes in another
-    way, therefore sees the same.
+    The draws of a step depend on these numbers alone, so they are the same in a resumed run, or if the run is divided
+    differently among processes.
     """
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)

@@ -1,7 +1,7 @@
-"""Intersection of rays with a mesh, by Embree (https://www.embree.org) through embreex, and what a camera sees of it.
+"""Ray-mesh intersection by Embree (https://www.embree.org) through embreex, and the surface visible to a camera.
 
-embreex belongs to the extra `render`. It is imported when a Tracer is made. The orthographic camera looks along -z at
-the square [-1, 1]^2. Its pixel is the mean of k x k samples on a regular grid. One sample at the centre is not enough:
+embreex is part of the extra `render` and is imported when a Tracer is made. The orthographic camera looks along -z at
+the square [-1, 1]^2. A pixel is the mean of k x k samples on a regular grid. One sample at the centre is not enough:
 on glossy metal its radiance is off by a tenth.
 """
 
@@ -18,20 +18,20 @@ from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.system.machine import import_extra
 
 OFFSET = 1e-4
-"""Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by
-about 1e-7, and one of 128 pixels is 0.016 wide."""
+"""Distance from the surface at which rays start. The frame has half-width 1, so float32 rounding displaces hits by
+about 1e-7; at 128 pixels, one pixel is 0.016 wide."""
 
 TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
 
 @dataclass(frozen=True)
 class Hits:
-    """The first surface points that N rays hit."""
+    """The first surface points hit by N rays."""
 
-    triangle: NDArray[np.int64]  # (N,) int, row of the mesh's faces
+    triangle: NDArray[np.int64]  # (N,) int, index of the face in the mesh
     weights: Floats  # (N, 3), barycentric weights of the corners
     position: Floats  # (N, 3), on the triangle
-    # normal, facet_normal: (N, 3), unit, interpolated and that of the triangle
+    # normal, facet_normal: (N, 3), unit, interpolated and of the flat triangle
     normal: Floats
     facet_normal: Floats
 
@@ -40,12 +40,12 @@ class Hits:
         return Hits(*(getattr(self, name)[rays] for name in self.__dataclass_fields__))
 
     def lifted(self) -> Floats:
-        """Return the starts of further rays (N, 3), slightly outside the surface."""
+        """Return the origins of secondary rays (N, 3), slightly outside the surface."""
         return self.position + np.float32(OFFSET) * self.facet_normal
 
 
 class Tracer:
-    """A mesh that is prepared for ray tracing. All arrays of origins and directions are (N, 3).
+    """A mesh prepared for ray tracing. All arrays of origins and directions are (N, 3).
 
     Raises UsageError if embreex is not installed.
     """
@@ -71,11 +71,11 @@ class Tracer:
     def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
         """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`.
 
-        With one light, F = 1, the directions may also be those of each origin, (N, 3).
+        With a single light (F = 1), the directions may also differ between origins: (N, 3).
         """
         free = np.zeros(facing.shape, dtype=bool)
         own = facing.shape[1] == 1 and len(directions) == len(origins)
-        # One light at a time: rays with the same direction need less memory and traverse the tree together.
+        # Trace one light at a time: parallel rays need less memory and traverse the tree together.
         for light, asked in enumerate(facing.T):
             rows = asked.nonzero()[0]
             if len(rows):
@@ -94,7 +94,7 @@ class ShadowCache:
     def __init__(self, tracer: Tracer, lights: Floats) -> None:
         self._tracer, self._lights = tracer, lights
         vertices = len(tracer.mesh.vertices)
-        # Rows that are never used take no memory.
+        # Unused rows take no memory.
         self._free = np.zeros((vertices, len(lights)), dtype=bool)
         self._known = np.zeros(vertices, dtype=bool)
 
@@ -129,11 +129,11 @@ def _packed(vectors: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class VisibleSurface:
-    """The surface points that the camera sees in P pixels, with S samples each."""
+    """The surface points visible to the camera in P pixels, with S samples each."""
 
-    mask: NDArray[np.bool_]  # (H, W), the pixels that are seen
+    mask: NDArray[np.bool_]  # (H, W), the visible pixels
     normals: Floats  # (P, 3), unit, the mean of the samples' normals; pixels row-major
-    samples: Hits  # P * S surface points; those of one pixel follow each other
+    samples: Hits  # P * S surface points, grouped by pixel
     samples_per_pixel: int  # S
     coverage: Floats  # (P,), share of the pixel that the surface fills; below 1 at its outline
 
@@ -148,11 +148,12 @@ def find_visible_surface(
 ) -> VisibleSurface:
     """Trace the camera's rays: size x size pixels of samples x samples samples each.
 
-    A pixel is left out if more than half of its samples miss the surface, or if it is seen at a grazing angle. Samples
-    that miss are replaced by the others of their pixel.
+    A pixel is dropped if more than half of its samples miss the surface, or if the surface is at a grazing angle.
+    Samples that miss are replaced by other samples of the same pixel.
 
     Args:
-        bend: returns the normals (N, 3) of the samples from those of the mesh and their positions; None to keep them.
+        bend: function that returns new normals (N, 3) from the mesh normals and positions of the samples; None to keep
+            the mesh normals.
     """
     steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(2 / (size * samples)) - 1
     row, column = np.meshgrid(np.arange(size * samples), np.arange(size * samples), indexing="ij")
@@ -173,7 +174,7 @@ def find_visible_surface(
     first = np.cumsum(found) - found  # row of the first sample of each pixel
     rows = first[seen, None] + np.arange(per_pixel) % found[seen, None]
     normals = unit(hits.normal[rows].mean(axis=1))
-    kept = normals[:, 2] > 0.05  # pixels that are seen at a more grazing angle are left out
+    kept = normals[:, 2] > 0.05  # drop pixels at a more grazing angle
     coverage = (found[seen] / per_pixel).astype(np.float32)
     seen[seen] = kept
     mask = seen.reshape(size, size)

@@ -1,7 +1,7 @@
-"""Light transport: the radiance of a mesh, seen by the orthographic camera, under single directional lights.
+"""Light transport: the radiance of a mesh in the orthographic camera under single directional lights.
 
-The unit of radiance is that of a matte white surface that faces the light. Each sample of a pixel is shaded with its
-own interpolated normal.
+A matte white surface facing the light has radiance 1. Each sample of a pixel is shaded with its own interpolated
+normal.
 
 Indirect light is gathered along random paths that start at the samples (Kajiya, "The rendering equation", 1986). All
 lights illuminate each vertex of a path at once. Visibility does not depend on the material, so paths and shadows are
@@ -9,7 +9,7 @@ traced once for all materials.
 
 Two approximations reduce noise, because caustics would otherwise appear as single bright pixels. First, surfaces
 that emit or receive indirect light have at least roughness SOFTEST (path space regularization, Kaplanyan & Dachsbacher
-2013). Second, shadows beyond the first surface are those of the nearest vertex.
+2013). Second, surface points beyond the first use the shadows of the nearest vertex.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer, VisibleSurface
 
-SOFTEST = 0.3  # lowest roughness of surfaces that light other surfaces
+SOFTEST = 0.3  # lowest roughness of surfaces that illuminate other surfaces
 
 SHADED_ROWS = 512
-"""Number of points that are shaded together. A tensor then has about a megabyte and stays in the cache."""
+"""Number of points shaded together. A tensor then takes about a megabyte and stays in the cache."""
 
 Materials = Mapping[str, PrincipledMaterial]
 Progress = Callable[[float], None]
@@ -68,7 +68,7 @@ def render_direct(
 
 
 def _covered(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
-    """Return the radiance before darkness: what the surface does not fill of a pixel is black."""
+    """Return the radiance in front of a black background, weighted by the coverage of each pixel."""
     coverage = torch.from_numpy(visible.coverage)[:, None]
     return {name: values.mul_(coverage) for name, values in radiance.items()}
 
@@ -101,7 +101,7 @@ def render_indirect(
 ) -> dict[str, Tensor]:
     """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times before.
 
-    `patch_of_face` (T,) is the row of the materials of each face, `directions` the number of paths per pixel.
+    `patch_of_face` (T,) gives the row of each face in the materials, `directions` the number of paths per pixel.
     """
     pixels = len(visible.normals)
     soft = {name: soften(material) for name, material in materials.items()}
@@ -112,7 +112,7 @@ def render_indirect(
         rows = torch.arange(start, min(start + at_once, pixels))
         ordinal = torch.arange(directions).repeat(len(rows))
         pixel = rows.repeat_interleave(directions)
-        # Each sample gets directions of all lobes.
+        # Each sample gets directions from all lobes.
         turn = torch.div(ordinal, len(LOBES), rounding_mode="floor")
         sample = pixel * visible.samples_per_pixel + turn % visible.samples_per_pixel
         hits = visible.samples.take(sample.numpy())
@@ -135,7 +135,7 @@ def render_indirect(
 
 
 def soften(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Return the reflectance without its sharpest lobes, for surfaces that light other surfaces."""
+    """Return the reflectance without its sharpest lobes, for surfaces that illuminate other surfaces."""
     return replace(
         material,
         roughness=material.roughness.clamp(min=SOFTEST),
@@ -153,14 +153,14 @@ def _extend(
     ordinal: Tensor,
     shift: Tensor,
 ) -> tuple[_Vertices, dict[str, Tensor]]:
-    """Return the next vertices of the paths that meet the surface again, and the weights (N, 1) of those paths."""
+    """Return the next vertices of the paths that hit the surface again, and the weights (N, 1) of those paths."""
     normals = torch.from_numpy(vertices.hits.normal)
     direction, density = draw_directions(normals, vertices.back, ordinal, shift)
     n_dot_w = (normals * direction).sum(-1, keepdim=True)
     above = (n_dot_w[:, 0] > 0).nonzero()[:, 0]
     rays, hits = tracer.first_hits(vertices.hits.lifted()[above.numpy()], direction[above].numpy())
     arriving = -direction[above[torch.from_numpy(rays)]].numpy()
-    # The inside of the surface is black. So is a point whose interpolated normal faces away.
+    # The inside of the surface is black, and so are points whose interpolated normal faces away.
     outside = (hits.facet_normal * arriving).sum(axis=1) > 0
     outside &= (hits.normal * arriving).sum(axis=1) > 0
     rows = above[torch.from_numpy(rays[outside])]
@@ -194,13 +194,13 @@ def _gather(
         n_dot_v = (normals * back).sum(-1, keepdim=True)
         # Opposite directions have no bisector.
         l_dot_v = (back @ lights.T).clamp(min=-0.9999)
-        # Vertices of a pixel follow each other, so a product with few rows sums them.
+        # Vertices are grouped by pixel, so a product with few rows sums them.
         pixels, place = torch.unique_consecutive(vertices.pixel[some], return_inverse=True)
         for name, material in materials.items():
             shaded = material.take(vertices.patches[some]).shade(cosines, n_dot_v, l_dot_v)
             spread = torch.zeros(len(pixels), len(place))
             spread[place, torch.arange(len(place))] = weights[name][some, 0]
-            # Limits on the contribution of one path, relative to its expected share. Larger values are only noise.
+            # Limit the contribution of one path, relative to its expected share. Larger values are only noise.
             radiance[name][pixels] += spread @ shaded.clamp(max=8.0)
 
 
@@ -225,9 +225,9 @@ LOBES = (0.0, 0.1, 0.0, 0.35)
 def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
     """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the horizon.
 
-    The normals of the surfaces and the directions `back` to the previous vertices of the paths are (N, 3), unit.
-    `first` (N,) int64, the index of the direction among those of its pixel, determines the lobe and the point of the R2
-    sequence (Roberts 2018), which covers the lobe evenly. `shift` (N, 2) is the offset of the pixel in the sequence.
+    The surface normals and the directions `back` to the previous vertices of the paths are (N, 3), unit. `first` (N,)
+    int64 is the index of the direction within its pixel. It selects the lobe and the point of the R2 sequence (Roberts
+    2018), which covers the lobe evenly. `shift` (N, 2) is the offset of the pixel in the sequence.
     """
     ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
     u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0
@@ -248,7 +248,7 @@ def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor)
 
 
 def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
-    """Return the density of the mixture per steradian, from cosines that have the same shape."""
+    """Return the density of the mixture per steradian, from cosines of the same shape."""
     half_length = (2 * (1 + w_dot_v)).clamp(min=1e-6).sqrt()
     n_dot_h = ((n_dot_w + n_dot_v) / half_length).clamp(0, 1)
     total = LOBES.count(0.0) * n_dot_w.clamp(min=0) / math.pi
@@ -272,14 +272,14 @@ def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Return visible normals (N, 3) in the frame of the surface normal, by the routine of Heitz."""
+    """Return visible normals (N, 3) in the frame of the surface normal, by Heitz's method."""
     stretched = torch.nn.functional.normalize(
         torch.cat((alpha * view[:, :2], view[:, 2:].clamp(min=1e-4)), dim=1), dim=1
     )
     first, second = basis(stretched)
     radius, angle = u.sqrt(), 2 * math.pi * v
     across, along = radius * angle.cos(), radius * angle.sin()
-    # `second` must be the axis along which the disc is cut by the horizon: the one nearer to the normal.
+    # `second` must be the axis along which the horizon cuts the disc, the axis closer to the normal.
     upward = torch.stack((first[:, 2], second[:, 2]), dim=1)
     length = upward.norm(dim=1, keepdim=True).clamp(min=1e-6)
     cosine, sine = (upward / length).unbind(dim=1)

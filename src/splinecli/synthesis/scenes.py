@@ -1,7 +1,7 @@
 """Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018).
 
-A scene has one shape, three sets of materials of each of three classes, and directional lights over the whole upper
-hemisphere. Further materials take little time, because the paths of light are the same. It depends only on (seed,
+A scene has one shape, three sets of materials in each of three classes, and directional lights over the whole upper
+hemisphere. Additional materials take little time, because the light paths are the same. A scene depends only on (seed,
 index), so an interrupted set can be continued.
 """
 
@@ -21,7 +21,7 @@ from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import Relief, draw_detail, draw_shape, read_relief
 
 MATERIALS = {f"{name}{suffix}": kinds for suffix in ("", "-2", "-3") for name, kinds in CLASSES.items()}
-"""The sets of materials of a scene, and for each the range of the number that selects the kind; see draw_material."""
+"""The material sets of a scene, each with the range of the number that selects the kind; see draw_material."""
 
 MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewing direction
 
@@ -44,7 +44,7 @@ class Scene:
     shape: str  # kind of the shape
     mesh: Mesh  # the shape
     lights: Floats  # (F, 3), unit directions towards the lights
-    materials: dict[str, PrincipledMaterial]  # those of MATERIALS, with one row per patch of the surface
+    materials: dict[str, PrincipledMaterial]  # by the names in MATERIALS, with one row per patch of the surface
     patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
     seed: int  # seed of the paths of indirect light
     relief: Relief | None = None  # on the surface
@@ -56,20 +56,20 @@ class RenderedScene:
 
     mask: NDArray[np.bool_]  # (H, W)
     normals: Floats  # (P, 3), unit; pixels row-major
-    # those of MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light and fills the pixel
+    # by the names in MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light and fills the pixel
     observations: dict[str, Floats]
 
 
 def draw_scene(
     seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None, reliefs: Sequence[Path] = ()
 ) -> Scene:
-    """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
+    """Draw scene number `index` of the set with this seed, with the given mesh or, for None, a random shape.
 
-    Half of the scenes have the relief of one of the normal maps, if any are given; see draw_detail.
+    Half of the scenes get a relief from one of the normal maps, if any are given; see draw_detail.
 
-    The surface has one patch in 60 % of the scenes, as real objects have one material or few, 2 to 12 in 25 %, and 20
-    to 3,000 in 15 %. In half of the scenes the patches differ in their base alone, as on a painted or printed object of
-    one gloss. Raises UsageError if the extra `render` is not installed.
+    The surface has one patch in 60 % of the scenes, as real objects have one or few materials, 2 to 12 in 25 %, and 20
+    to 3,000 in 15 %. In half of the scenes the patches differ only in their base colour, as on a painted or printed
+    object of uniform gloss. Raises UsageError if the extra `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
@@ -82,7 +82,7 @@ def draw_scene(
     for name, kinds in MATERIALS.items():
         material = draw_material(patches, generator, kinds)
         materials[name] = with_one_gloss(material) if one_gloss else material
-    # The shape comes last, because the number of random values that it needs varies.
+    # Draw the shape last, because it needs a varying number of random values.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
     shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
@@ -123,8 +123,8 @@ def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], 
 def draw_lights(count: int, rng: np.random.Generator) -> Floats:
     """Draw light directions (count, 3), about uniform over the upper hemisphere.
 
-    They are a Fibonacci spiral (Gonzalez 2010), turned by a random angle. Each light is then moved by a third of the
-    mean distance.
+    They are a Fibonacci spiral (Gonzalez 2010), rotated by a random angle. Each light is then moved by a third of
+    the mean distance.
     """
     order = np.arange(count)
     z = 1 - (1 - MIN_LIGHT_Z) * (order + 0.5) / count

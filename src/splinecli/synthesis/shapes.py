@@ -1,9 +1,9 @@
-"""Random shapes with folds, hollows and occlusions as sculptures have, and the relief on their surface.
+"""Random shapes with folds, hollows and occlusions like those found in sculptures, and the relief on their surface.
 
-Shapes are made of signed distance fields. Unions of round blobs alone would be too convex: they have few cast shadows
-and few interreflections. Relief is a tileable normal map that turns the visible normals, because meshes are smooth from
-one pixel to the next. Stone, cloth and leather are not, and networks that were trained without such detail smooth it
-away. Shadows stay those of the mesh.
+Shapes are built from signed distance fields. Unions of round blobs alone would be too convex, with few cast shadows and
+interreflections. Relief is a tileable normal map that perturbs the visible normals, because meshes are smooth from one
+pixel to the next. Stone, cloth and leather are not, and networks trained without such detail smooth it away. Relief
+does not affect the shadows.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
 
 
 def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
-    """Draw a random shape of one kind: `carved`, `rough`, `relief` or `vessel`. Raises what draw_shape does."""
+    """Draw a random shape of one kind: `carved`, `rough`, `relief` or `vessel`. Raises like draw_shape."""
     while True:
         mesh = KINDS[name](rng)
         if mesh is not None and len(mesh.faces) > FEWEST_FACES:
@@ -63,18 +63,18 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
 
 
 def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> Mesh:
-    """Draw a view of a mesh, which is in the frame.
+    """Draw a random view of a mesh that fits the frame.
 
-    The rotation is uniform. In half of the views another mesh, of one of the files `others` and scaled by U(0.4, 1),
-    touches it: between bodies there are hollows with long shadows and indirect light. Half of the views are enlarged by
-    U(1, 2.2) around a point of the surface, so that they show a part.
+    The rotation is uniform. In half of the views another mesh, from one of the files `others` and scaled by U(0.4, 1),
+    touches it, because gaps between bodies have long shadows and indirect light. Half of the views are magnified by
+    U(1, 2.2) around a point on the surface, so that they show only a part.
     """
     mesh = turn(mesh, draw_rotation(rng))
     if others and rng.random() < 0.5:
         mesh = _touching(mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng)
     mesh = fit_to_frame(mesh)
     if rng.random() < 0.5:
-        # A view is enlarged by up to this factor.
+        # A view is magnified by up to this factor.
         enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
         shift = np.append(middle * (1 - enlarged), 0)
         mesh = Mesh((mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals)
@@ -82,7 +82,7 @@ def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> M
 
 
 def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return both meshes, the other one smaller, moved in a random direction so that it overlaps by 40 % at most."""
+    """Return both meshes, the other one scaled down and moved in a random direction to overlap by 40 % at most."""
     direction = rng.normal(size=3) * np.array((1, 1, 0.5))
     direction /= np.linalg.norm(direction)
     vertices = other.vertices * rng.uniform(0.4, 1.0)
@@ -129,7 +129,7 @@ _draw_folds = partial(_draw_waves, ridged=True)
 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:
-    """Draw three to seven merged and bent solids with three to eight pieces cut out, often with folds."""
+    """Draw a union of three to seven warped solids with three to eight pieces cut out, often with folds."""
     solids = [_place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))]
     tools = [_place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7)) for _ in range(rng.integers(3, 9))]
     blend, seam = rng.uniform(0.05, 0.25), rng.uniform(0.02, 0.08)
@@ -167,7 +167,7 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
         shape = np.linalg.norm(bent, axis=1) - np.float32(0.7) - swell(bent) - detail(bent)
         for crater in craters:
             shape = meshes.smooth_cut(shape, crater(bent), 0.05)
-        # Noise makes the field steeper. Scale it, so that it stays close to a distance.
+        # Noise makes the field steeper. Scale it to keep it close to a distance.
         return np.asarray(shape * np.float32(0.7))
 
     mesh = meshes.triangulate(distance, (1.3, 1.3, 1.3), SPACING)
@@ -230,7 +230,7 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
 
 
 def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
-    """Draw the radius over the height from -1 to 1, a smooth curve through five radii; half widen to the mouth."""
+    """Draw the radius over the height from -1 to 1, a smooth curve through five radii; half widen towards the mouth."""
     from scipy.interpolate import PchipInterpolator
 
     radii = rng.uniform(0.35, 0.9, 5)
@@ -248,15 +248,15 @@ KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {
 }
 
 
-_LEAST_Z = 0.1  # lowest z to which a relief turns a normal that was higher
-_STEEPEST = 4.0  # largest slope that is read from a normal map
+_LEAST_Z = 0.1  # lowest z to which a relief tilts a normal with a higher z
+_STEEPEST = 4.0  # largest slope read from a normal map
 
 
 def read_relief(path: Path) -> Floats:
     """Read a tileable normal map, RGB = (n + 1) / 2, as the slopes (h, w, 2) of its height along its columns and rows.
 
-    Whether green points up or down is found from the slopes: those of a surface have no curl. Raises InputError if the
-    file is not a colour image. The vectors need no unit length.
+    The direction of green, up or down, is inferred from the slopes, because the slopes of a surface have no curl. The
+    vectors need not have unit length. Raises InputError if the file is not a colour image.
     """
     normals = 2 * read_image(path) - 1
     if normals.shape[2] != 3:
@@ -270,16 +270,16 @@ def read_relief(path: Path) -> Floats:
 
 @dataclass(frozen=True)
 class Relief:
-    """A relief, projected along three axes: each point of a surface uses the axis that is nearest to its normal."""
+    """A relief, projected along three axes: each point of a surface uses the axis nearest to its normal."""
 
-    slopes: Floats  # (h, w, 2), of the height along the columns and the rows
+    slopes: Floats  # (h, w, 2), slopes of the height along the columns and the rows
     axes: Floats  # (3, 3), orthonormal rows
     period: float  # width of one tile; the camera's square is 2 wide
 
     def bend(self, normals: Floats, positions: Floats) -> Floats:
         """Return the normals (N, 3) of points (N, 3) of a surface with this relief.
 
-        A normal that would turn away from the camera is turned by less.
+        The perturbation is reduced for normals that would otherwise face away from the camera.
         """
         local, places = normals @ self.axes.T, positions @ self.axes.T / np.float32(self.period)
         first = (np.abs(local).argmax(axis=1) + 1) % 3
@@ -300,8 +300,8 @@ class Relief:
 def draw_detail(slopes: Floats, size: int, rng: np.random.Generator) -> Relief:
     """Draw a relief from the slopes of a normal map, for images of `size` pixels a side.
 
-    A tile is 10^U(-0.6, 0.4) wide, in units of half the frame. The root mean square of the slopes, in the resolution of
-    a third of a pixel, is U(0.05, 0.6). The axes are uniform over all rotations.
+    A tile is 10^U(-0.6, 0.4) wide, in units of half the frame. The root mean square of the slopes, at a resolution of a
+    third of a pixel, is U(0.05, 0.6). The axes are uniform over all rotations.
     """
     period = float(10 ** rng.uniform(-0.6, 0.4))
     side = max(8, round(1.5 * size * period))

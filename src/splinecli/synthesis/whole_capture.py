@@ -1,4 +1,4 @@
-"""Pixels as one capture shows them: with what lies behind the object, and with faults that all pixels share."""
+"""Simulation of whole captures, with a background behind the object and faults common to all pixels."""
 
 import math
 from collections.abc import Callable
@@ -22,15 +22,15 @@ from splinecli.synthesis.faults import (
 from splinecli.synthesis.optics import draw_optics
 from splinecli.synthesis.random_numbers import draw_number
 
-_BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one from which the exposure is chosen
+_BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one that sets the exposure
 _GRAINY_SHARE = 1 / 3
 _MOST_SATURATED = 0.03  # largest share of clipped observations in an overexposed capture
 _UNMEASURED_SHARE = 0.3
 _MOST_UNMEASURED = 0.5
-"""Of the captures with errors of the intensities, this share has large ones, with a sigma of up to so many stops."""
+"""Of the captures with intensity errors, the share with large ones, and the largest sigma of these in stops."""
 
-_MARGIN = 16  # most pixels that are added at each side of the object
-_WIDEST_RIM = 12  # most pixels by which a careless mask is too wide
+_MARGIN = 16  # most pixels added on each side of the object
+_WIDEST_RIM = 12  # most pixels by which an imprecise mask is too wide
 
 
 def photograph_captures(
@@ -41,16 +41,16 @@ def photograph_captures(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph pixels of the number G of captures that the configuration says; pixel p belongs to capture p % G.
+    """Photograph pixels of the G captures set by the configuration; pixel p belongs to capture p % G.
 
-    See `photograph` for the arguments. The pixels of a capture have the same directions, and the valid ones come first.
+    See `photograph_scene` for the arguments. All pixels of a capture have the same directions, valid ones first.
     """
     if config.capture_pixels == 1:
         return photograph(truth, radiance, directions, valid, config, generator)
     captures = config.captures(len(radiance))
     observations, calibrated = torch.zeros_like(radiance), directions.clone()
     exposure = torch.ones_like(radiance[:, :1])
-    # The faults of a capture are drawn on the processor.
+    # Draw the faults of a capture on the CPU.
     seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
     own = torch.Generator().manual_seed(seed)
     for capture in range(captures):
@@ -71,16 +71,16 @@ def photograph_scene(
     Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
     radiance to the observations.
 
-    Under ambient light, all images show a share 10^U(-3.2, -1) of the mean of the pixel's radiance over the lights, as
-    from a room, and of the capture's mean, as by glare in the lens; see `_ambient`.
+    Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the lights, as from room
+    light, and of the capture's mean, as from lens glare; see `_ambient`.
 
     The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
-    the observations are clipped, and restored as `infer` does. A third of the captures with sensor noise also have a
-    grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where images are
-    shifted by a part of a pixel or light arrives from neighbours. Of the captures with errors of the intensities, 30 %
-    have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many
-    degrees, and their detail is still right.
+    the observations are clipped, and restored as in `infer`. A third of the captures with sensor noise also have grain:
+    each observation is multiplied by its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture causes such grain
+    if images are shifted by a fraction of a pixel or light scatters between neighbours. Of the captures with intensity
+    errors, 30 % have an additional error with a sigma of U(0, 0.5) stops, as if the intensities had not been measured.
+    The normals are then wrong by many degrees, but their detail is still correct.
     """
     return _photograph(radiance, directions, config, generator, None)
 
@@ -88,11 +88,11 @@ def photograph_scene(
 def photograph_images(
     images: Tensor, mask: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, float]:
-    """Photograph images (F, H, W) of radiance with their background; return what photograph_scene does of a mask.
+    """Photograph radiance images (F, H, W) with background; return the same as photograph_scene, for a mask's pixels.
 
-    `config.optics_share` of the captures come from a camera of draw_optics, which mixes neighbouring pixels. Its
-    saturation and noise are those of the sensor, before a Bayer pattern is interpolated. As in `infer`, the blur is
-    estimated and removed.
+    `config.optics_share` of the captures use a camera from draw_optics, which mixes neighbouring pixels. Saturation and
+    noise are applied at the sensor, before the Bayer pattern is interpolated. As in `infer`, the blur is estimated and
+    removed.
     """
     return _photograph(images.flatten(1).T, directions, config, generator, mask)
 
@@ -100,7 +100,7 @@ def photograph_images(
 def _photograph(
     radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator, mask: Tensor | None
 ) -> tuple[Tensor, Tensor, float]:
-    """Photograph radiance (P, F), of the pixels that are wanted or, with a mask (H, W) of these, of all of an image."""
+    """Photograph radiance (P, F) of the requested pixels or, with their mask (H, W), of all pixels of an image."""
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
@@ -154,24 +154,24 @@ def _photograph(
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:
-    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds of `photograph_scene`.
+    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds in `photograph_scene`.
 
-    Light transport is linear, so the mean over the lights is what a room shows that is as bright on all sides. It is
-    about half of the albedo, so the levels are those of draw_ambient in effects.py.
+    Light transport is linear, so the mean over the lights is the radiance in a uniformly bright room. It is about half
+    of the albedo, so the levels match draw_ambient in pixels.py.
     """
     level = 10 ** uniform(-3.2, -1.0) * (uniform() < share)
     return level * torch.lerp(radiance.mean(dim=1, keepdim=True), radiance.mean(), uniform())
 
 
 def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that shows some of it.
+    """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that includes some background.
 
-    Masks may show more than the object, and captures may have none. The maps of the object are radiance (F, H, W) and
-    unit normals (3, H, W), under unit lights (F, 3); those that are returned have zero for normals that are not known:
-    in darkness, and where the light is uneven.
+    Real masks may include more than the object, and captures may have no mask. The maps of the object are radiance
+    (F, H, W) and unit normals (3, H, W), under unit lights (F, 3). The returned maps have zero for unknown normals: in
+    darkness, and under uneven light.
 
-    A third of the backgrounds are nearly dark. The others are plates of draw_engraved in the shadow of the object, at a
-    distance of up to half its size. Half of these are lit unevenly, as by near lamps. Half of the masks show
+    A third of the backgrounds are nearly dark. The others are plates from draw_engraved in the shadow of the object, at
+    a distance of up to half its size. Half of the plates are lit unevenly, as by near lamps. Half of the masks cover
     everything, the others are up to 12 pixels too wide.
     """
     uniform = partial(draw_number, generator)
@@ -203,7 +203,7 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
 
 
 def _shadows(mask: Tensor, lights: Tensor, distance: float) -> Tensor:
-    """Return where (F, H, W) the object throws a shadow on a plane that lies `distance` pixels behind it."""
+    """Return the mask (F, H, W) of the shadow that the object casts on a plane `distance` pixels behind it."""
     reach = max(mask.shape)
     canvas = pad(mask, (reach,) * 4)
     found = []

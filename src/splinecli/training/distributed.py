@@ -1,7 +1,7 @@
 """Data-parallel training: torchrun starts several processes, and each trains on its shards of every batch.
 
 After each backward pass the processes average their gradients in one message, with gloo on CPUs and NCCL on GPUs.
-Every process then computes the same update of the same weights. They exchange nothing else but the training time of
+Every process then computes the same update of the same weights. The only other data exchanged is the training time of
 the first process.
 """
 
@@ -21,14 +21,14 @@ from splinecli.errors import ModelError, UsageError
 
 @dataclass(frozen=True)
 class Workers:
-    """The place of this process among `count` processes. Rank 0 leads: it alone writes and keeps the time."""
+    """The rank of this process among `count` processes. Rank 0 leads: only it writes files and keeps the time."""
 
     rank: int = 0
     count: int = 1
 
     @property
     def leads(self) -> bool:
-        """Whether this process leads."""
+        """Whether this process is the leader."""
         return self.rank == 0
 
     def shards(self, total: int) -> range:
@@ -84,15 +84,15 @@ def is_launched() -> bool:
 
 
 def restarts_are_allowed() -> bool:
-    """Return whether torchrun starts the processes again when one fails. They then continue the run.
+    """Return whether torchrun restarts the processes when one fails. They then continue the run.
 
-    Whether it has just done so cannot be known: torchrun does not report the failures of other machines.
+    There is no way to know whether this has just happened: torchrun does not report failures on other machines.
     """
     return int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
-    """Join the other processes, if torchrun started any; return the place of this process and its own device."""
+    """Join the other processes, if torchrun started any; return the rank of this process and its device."""
     if not is_launched():
         return Workers(), device
     if device.type == "cuda":
@@ -102,8 +102,8 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
         backend = "nccl" if device.type == "cuda" else "gloo"
         attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
         if attempt and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
-            # torchrun keeps its store after a restart, with the addresses of processes that have ended. The number
-            # of the attempt makes a fresh part of it. Only on one machine do all processes know the same number.
+            # torchrun keeps its store after a restart, with the addresses of processes that have ended. Prefixing the
+            # keys with the attempt number hides these. All processes agree on the number only on a single machine.
             store, rank, count = next(rendezvous("env://"))
             store = PrefixStore(f"splinecli attempt {attempt}", store)
             dist.init_process_group(backend, store=store, rank=rank, world_size=count)
@@ -113,6 +113,6 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
 
 
 def leave_workers() -> None:
-    """Leave the group of processes, if this process joined one."""
+    """Leave the process group, if this process joined one."""
     if dist.is_available() and dist.is_initialized():
         dist.destroy_process_group()

@@ -1,6 +1,6 @@
 """The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run.
 
-A run is started or continued in a folder, alone or with the other processes of torchrun.
+A run starts or continues in a folder, with one process or with all processes of torchrun.
 """
 
 import copy
@@ -47,9 +47,9 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network. It may have parts that they lack.
+    """Copy the weights into the network, which may have additional parts.
 
-    These are an error head, refinement nets and layers that see the capture.
+    Additional parts can be an error head, refinement nets and layers that use the whole capture.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
@@ -72,7 +72,7 @@ def _start_from(weights: str, network: SplineNet) -> None:
 class Trainer:
     """A run and its folder: checkpoint, weights, config.json, log and pictures.
 
-    With several processes, only the leader writes.
+    With several processes, only the leader writes files.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Trainer:
         return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
-        """Train to the end, save on the way, and return the last metrics on the leader. A run at its end stays.
+        """Train to the end, saving regularly, and return the last metrics on the leader. A finished run is left alone.
 
         Args:
             report: called with progress and metrics at each entry of the log.
@@ -172,7 +172,7 @@ class Trainer:
         config = self.config
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, self.counters.step, self.progress)
-        # Dropout draws from the global generator. Its seed is that of the step, so a resumed run drops the same.
+        # Dropout draws from the global generator. It is seeded by the step, so a resumed run drops the same channels.
         torch.manual_seed(stream_seed(config.seed, self.counters.step, DROPOUT_STREAM + self.workers.rank))
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
@@ -194,7 +194,7 @@ class Trainer:
     def save(self) -> None:
         """Write averaged weights, pictures and checkpoint. Raises OutputError.
 
-        The checkpoint comes last: a run that is killed before repeats the steps, and writes the others again.
+        The checkpoint comes last: a run killed before that point repeats the steps and rewrites the other files.
         """
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
@@ -202,7 +202,7 @@ class Trainer:
         save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
 
     def _check_weights(self) -> None:
-        """Raise ModelError where a weight is not finite, before it is saved."""
+        """Raise ModelError if a weight is not finite, before it is saved."""
         for name, tensor in self.network.state_dict().items():
             if not torch.isfinite(tensor).all():
                 raise self._not_finite(f"the tensor {name} is no longer finite")
@@ -215,14 +215,14 @@ class Trainer:
         return ModelError(f"{problem} at step {self.counters.step}", path=self.folder, hint=hint)
 
     def _follow(self) -> None:
-        # The decay grows with the steps, because a young average would depend on the start for too long.
+        # Increase the decay with the steps; otherwise the average would depend on the initial weights for too long.
         decay = min(self.config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
         with torch.no_grad():
             for averaged, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 averaged.lerp_(current, 1 - decay)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
-        """Return the metrics of means (N, 6) over the steps of each part: of both, or of NE-Net and LI-Net."""
+        """Return the metrics from means (N, 6) over the steps of each part: both together, or NE-Net and LI-Net."""
         # Each network has its own loss, so losses are added. Errors are averaged.
         summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
         checked_deg = self.task.validation_deg(self.average, bfloat16=self.bfloat16) if check else None
@@ -246,8 +246,8 @@ def configure_run(
 ) -> tuple[TrainingConfig, bool]:
     """Return the configuration of a run, and whether it continues. Raises ModelError, UsageError.
 
-    It continues on request, or after torchrun has started its processes again: with --max-restarts, one command both
-    starts a run and continues it. Without a preset, settings of such a run that are not given stay.
+    A run continues on request, or after torchrun has restarted its processes: with --max-restarts, one command both
+    starts a run and continues it. Without a preset, settings that are not given keep the values of the continued run.
     """
     if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
         return configure(preset_name, file, changes), False
@@ -270,10 +270,10 @@ def open_run(
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
 
-    `warn` receives a sentence about what a killed process had left in the folder, `say` one about a long start.
+    `warn` receives a message about files left by a killed process, `say` a message about a slow start.
 
     Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
-    installed; ModelError if the checkpoint does not fit, or weights to start from cannot be used; InputError if a pixel
+    installed; ModelError if the checkpoint does not fit, or the initial weights cannot be used; InputError if a pixel
     set cannot be used; OutputError if the folder cannot be written, or has a run in it and `resume` is not set.
     """
     check_writable(folder)

@@ -1,7 +1,7 @@
 """The losses of SPLINE-Net (Zheng et al., ICCV 2019, section 3), for both networks or for one while the other is fixed.
 
-Every loss is the mean of one number for each pixel. The loss of a batch is therefore the mean of the losses of equal
-parts of it. The paper does not say whether |.| sums or averages the cells of a map; here the argument `norm` does.
+Every loss is the mean of one number per pixel. The loss of a batch is therefore the mean of the losses of its equal
+parts. The paper does not specify whether |.| is a sum or an average over the cells of a map; the argument `norm` does.
 """
 
 import math
@@ -23,28 +23,28 @@ Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
 
 TYPICAL_ERROR = math.radians(2.5)
-"""Added to the error of a capture, whose root divides its loss. Without it, captures that are good already would count
-too much."""
+"""Added to the error of a capture before its loss is divided by the square root. Without this offset, captures that are
+already accurate would have too much weight."""
 
 AXIS_LENGTH = 0.01
 """Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth."""
 
 
 class Losses(NamedTuple):
-    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed."""
+    """The total loss and its unweighted terms. Each is a scalar, NaN if it was not computed."""
 
     total: Tensor
     angle: Tensor  # in radians
     # on_map, masked: means over cells
     on_map: Tensor
     masked: Tensor
-    # symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm
+    # symmetric, asymmetric: the sums of the LI-Net and NE-Net terms, each in its norm
     symmetric: Tensor
     asymmetric: Tensor
 
 
 def part_of_step(config: TrainingConfig, step: int) -> Part:
-    """Return which networks a step updates."""
+    """Return which networks are updated in a step."""
     if config.updates == "joint":
         return "both"
     if config.updates in ("error_head", "refine_net"):
@@ -66,8 +66,9 @@ def compute_losses(
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks
-    are updated, the losses are added and the angle counts once. Where pixels share captures, the angle is divided by
-    the root of the capture's error. The loss of the error head is minus the log-likelihood of the angle.
+    are updated, the losses are added and the angle is included only once. If pixels share captures, the angle is
+    divided by the square root of the capture's error. The loss of the error head is the negative log-likelihood of the
+    angle.
     """
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored))
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
@@ -79,7 +80,7 @@ def compute_losses(
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
         return Losses(error_negative_log_likelihood(error, angle).mean(), angle.mean(), *[missing] * 4)
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
-    # The maps are half of the work of a batch, and CNN-PS does not use them.
+    # The maps take half of the time of a batch, and CNN-PS does not use them.
     dense_truth = dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
     with fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
@@ -136,13 +137,13 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
     dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
     cells = values, dense.known, dense.filled
-    # The cells lie symmetrically, so reversed rows are the maps of the mirrored pixels.
+    # The cells are arranged symmetrically, so reversing the rows gives the maps of the mirrored pixels.
     return DenseMap(*(each.flip(2) for each in cells) if maps.mirrored else cells)
 
 
 @contextmanager
 def fixed(network: SplineNet, part: Part) -> Iterator[None]:
-    """Compute no gradients for parameters outside `part`. Gradients still pass through them."""
+    """Compute no gradients for parameters outside `part`. Gradients still propagate through them."""
     inside = {
         "both": ("",),
         "ne_net": ("ne_net.", "set_branch."),
@@ -174,22 +175,23 @@ def angles(normals: Tensor, truth: Tensor) -> Tensor:
 
 
 def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
-    """Return the mean error of captures (G,), each divided by the root of its reference: a degree counts more on a
-    capture that is nearly right.
+    """Return the mean error of captures (G,), each divided by the square root of its reference.
+
+    An error of one degree thus has more weight in a capture that is already accurate.
 
     Args:
         error: in radians.
-        reference: errors (G,) that say how hard a capture is; None for the same.
+        reference: errors (G,) that measure the difficulty of each capture; None to use `error`.
     """
     reference = error.detach() if reference is None else reference
     return (math.sqrt(2 * TYPICAL_ERROR) * error / (reference + TYPICAL_ERROR).sqrt()).mean()
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |D - D_gt| over some cells, or |M_s o (D - D_gt)| over those of the sparse map: the average or the sum.
+    """Return |D - D_gt| over the given cells, or |M_s o (D - D_gt)| over cells of the sparse map: average or sum.
 
-    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells that count, whose true value is
-    known, else 0.
+    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells to include, whose true value must
+    be known, else 0.
     """
     total = ((dense - truth).abs() * cells).sum((1, 2, 3))
     return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
@@ -200,7 +202,7 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
 
     The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are interpolated,
     so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has no
-    azimuth. Its map is rotated by 180 degrees, which is a symmetry of it as well.
+    azimuth. Its map is rotated by 180 degrees, which is also a symmetry.
     """
     size = maps.shape[-1]
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
@@ -209,7 +211,7 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
     axis = axis / axis.square().sum(1, keepdim=True).clamp(min=AXIS_LENGTH**2).sqrt()
     axis_x, axis_y = axis[:, 0, None, None], axis[:, 1, None, None]
     along = x * axis_x + y * axis_y
-    # grid_sample expects rows to count downwards, so y changes its sign.
+    # grid_sample expects rows to run downwards, so y changes sign.
     grid = torch.stack((2 * along * axis_x - x, -(2 * along * axis_y - y)), dim=-1)
     return grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
@@ -219,7 +221,8 @@ def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor,
 
     The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with stride 2. Maps D and
     `filled`, 1 in cells with a value, else 0, are (P, 1, w, w); normals are (P, 3), unit. Only filled cells with a
-    filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be mixed with empty cells.
+    filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be partly interpolated
+    from empty cells.
     """
     image, image_filled = torch.chunk(mirror(torch.cat((dense, filled), dim=1), normals), 2, dim=1)
     both = filled * (image_filled > 0.999)

@@ -1,4 +1,4 @@
-"""Training of the refinement net on rendered scenes as images, after a SPLINE-Net that stays as it is."""
+"""Training of the refinement net on images of rendered scenes, after a SPLINE-Net with fixed weights."""
 
 from __future__ import annotations
 
@@ -32,37 +32,37 @@ from splinecli.synthesis.whole_capture import add_background, photograph_images
 from splinecli.training.objective import angles, balanced
 
 FIRST_EXAMPLES = 160
-"""Captures that are photographed before the first step. With 64, the net learned these by heart and was worse on
-others for half an hour."""
+"""Number of captures simulated before the first step. With 64, the net memorised them and was worse on other captures
+for half an hour."""
 
 STEPS_PER_EXAMPLE = 6
-"""Steps after which another one is photographed: about half of the time of training on a processor."""
+"""Steps after which another capture is simulated, which takes about half of the training time on a CPU."""
 
 MOST_EXAMPLES = 2000
-"""More replace the oldest ones. One takes about a megabyte."""
+"""Largest number of captures; later ones replace the oldest. Each takes about a megabyte."""
 
 CROP = 96
-"""Side of the part of a larger map that an example has."""
+"""Side of the crop that an example takes from a larger map, in pixels."""
 
 _ENLARGED_SHARE = 0.3
 _MOST_ENLARGED = 3.0
-"""A share of the captures of scenes is enlarged, by a factor from 1 to this one."""
+"""The share of the scene captures that are enlarged, and the largest factor; the smallest is 1."""
 
 _BACKGROUND_SHARE = 0.35
-"""A share of the captures shows what lies behind the object; see add_background."""
+"""Share of the captures with a background behind the object; see add_background."""
 
 _DARK_MARGIN = REACH
-"""Pixels of darkness around the others, which a lens and its inverse filter mix with the outline."""
+"""Width in pixels of the dark margin, which a lens and its inverse filter mix with the outline."""
 
 _SCATTERING_SHARE = 0.2
-"""A share of the captures of diffuse scenes scatters light below the surface; see scatter."""
+"""Share of the captures of diffuse scenes with subsurface scattering; see scatter."""
 
 _ENGRAVED_SHARE = 0.4
 _ENGRAVED_SIZE = 80
-"""A share of the captures show no scene, but an engraved piece of this size; see draw_engraved."""
+"""The share of captures of engraved pieces instead of scenes, and the size of these pieces; see draw_engraved."""
 
 ERROR_WEIGHT = 0.05
-"""Weight of the likelihood of the errors beside the angle in radians."""
+"""Weight of the error likelihood relative to the angle in radians."""
 
 
 class SceneMaps(NamedTuple):
@@ -70,7 +70,7 @@ class SceneMaps(NamedTuple):
 
     Attributes:
         features: (CHANNELS, H, W) float16, see refine_features; zero outside the mask.
-        normals: (3, H, W) float16, the truth; zero where it is not known.
+        normals: (3, H, W) float16, ground truth; zero where unknown.
         mask: (1, H, W) bool.
     """
 
@@ -84,7 +84,7 @@ class SceneMaps(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What is photographed.
+    """A scene to be photographed.
 
     Attributes:
         maps: (F + 3, H, W), radiance under each light and true unit normals.
@@ -98,14 +98,14 @@ class Scene(NamedTuple):
 
 
 class ScenePool:
-    """Captures of scenes, each under its own lights and faults. The pool grows while training goes on.
+    """Captures of scenes, each with its own lights and faults. The pool grows during training.
 
     A capture depends only on (seed, its number).
 
     Args:
         scenes: pixel sets with some of their entries, and the weight of each set.
         network: a SPLINE-Net with an error head, on the device of the captures.
-        first: the number of the first capture. A run that continues begins with its newest captures.
+        first: the number of the first capture. A resumed run begins with its newest captures.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class ScenePool:
         self._made += 1
 
     def draw_scene(self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE) -> Scene:
-        """Draw a part of a scene, or an engraved piece, and the lights under which it is photographed."""
+        """Draw a part of a scene, or an engraved piece, and the lights of its capture."""
         if float(torch.rand((), generator=generator)) < engraved_share:
             return self._draw_engraved(generator)
         weights = torch.tensor([weight for _, _, weight in self.scenes])
@@ -167,7 +167,7 @@ class ScenePool:
         return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
 
     def _after_network(self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator) -> SceneMaps:
-        """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
+        """Photograph maps (F + 3, H, W) of radiance and true normals, and return SPLINE-Net's estimates."""
         if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
         else:
@@ -178,7 +178,7 @@ class ScenePool:
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
-        """Draw `count` captures, turn and mirror each, and stack them as float32 (count, ...)."""
+        """Draw `count` captures, rotate and mirror each, and stack them as float32 (count, ...)."""
         drawn = [
             _turned(self.examples[int(index)], generator)
             for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device)
@@ -196,8 +196,8 @@ def _placed(values: Tensor, mask: Tensor) -> Tensor:
 def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]:
     """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation between pixels of the mask.
 
-    A scene is rendered at few pixels, so its surface bends much from one to the next. A photograph of a real object
-    has more pixels, and its neighbours are more alike.
+    A scene is rendered at low resolution, so its normals change considerably between adjacent pixels. A photograph of a
+    real object has more pixels, and adjacent normals are more similar.
     """
     if scale == 1:
         return maps, mask
@@ -207,7 +207,7 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
 
 
 def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slice, slice]:
-    """Return a part of a map, `side` pixels a side at most, around a random pixel of the object."""
+    """Return a part of a map, at most `side` pixels wide and high, around a random pixel of the object."""
     places = mask.nonzero()
     middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
     lowest, highest = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
@@ -220,7 +220,7 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
 def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor) -> Tensor:
     """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W).
 
-    They are as in use with float32.
+    They are the same as at inference in float32.
     """
     method = "spline-net" if network.config.interpolates else "cnn-ps"
     loaded = LoadedNetwork(network.eval(), "in training", "")
@@ -282,9 +282,10 @@ def refinement_losses(
     """Compute the losses of stacked captures.
 
     The error of each capture is its mean angle, plus `detail_weight` times the mean error of the differences between
-    neighbours. Wrong lights turn all normals of a surface alike and hide in its angles how sharp its detail is, but not
-    in these differences. It is divided by the root of the capture's mean angle before refinement: a degree counts more
-    on a capture that is nearly right. The likelihood of the errors is that of the error head.
+    neighbours. Wrong lights rotate all normals of a surface alike. This masks the sharpness of the detail in the
+    angles, but not in these differences. The error is divided by the square root of the capture's mean angle before
+    refinement, so a degree has more weight in a capture that is already accurate. The likelihood of the errors is the
+    same as for the error head.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):

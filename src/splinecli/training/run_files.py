@@ -1,8 +1,8 @@
 """The files of a run: its log (metrics.csv, curves.png, maps.png, TensorBoard's event files) and its checkpoints.
 
-A checkpoint is one safetensors file from which a run continues where it stopped. It contains no state of a random
-generator: the draws of a step follow from the seed and the step number alone. A run of the refinement net photographs
-its newest captures again, and goes on without the earlier ones.
+A checkpoint is one safetensors file from which a run continues where it stopped. It contains no random generator state,
+because the draws of a step depend only on the seed and the step number. A resumed run of the refinement net simulates
+its newest captures again and continues without the earlier ones.
 """
 
 import csv
@@ -36,11 +36,11 @@ class Metrics:
     pixels: int  # number of training pixels drawn so far
     minutes: float  # training time so far
     learning_rate: float  # the rate of the last update
-    loss: float  # the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
+    loss: float  # the weighted sum of all terms. If LI-Net and NE-Net are updated in turn, the sum of both losses.
     angle_deg: float  # mean angular error of the training pixels, in degrees
     map_error: float | None  # mean absolute error of LI-Net's dense map. None without a LI-Net.
     masked_map_error: float | None  # the same over the cells of the sparse map
-    # symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
+    # symmetric, asymmetric: Ls and La, unweighted. None if their weights are 0.
     symmetric: float | None = None
     asymmetric: float | None = None
     # mean angular error of the validation pixels, in degrees. None between checkpoints.
@@ -48,14 +48,14 @@ class Metrics:
 
 
 _HEADER = ",".join(field.name for field in fields(Metrics))
-_LONGEST = 1 << 26  # bytes of a metrics.csv, about half a million lines
+_LONGEST = 1 << 26  # largest metrics.csv in bytes, about half a million lines
 
 
 class RunLog:
-    """Writer of the log files in `folder`. Its methods raise OutputError when a file cannot be written."""
+    """Writer of the log files in `folder`. Its methods raise OutputError if a file cannot be written."""
 
     def __init__(self, folder: Path, step: int, *, tensorboard: bool = False) -> None:
-        """Open the log at a step and drop the lines of later steps, which the run is about to repeat.
+        """Open the log at a step and drop the lines of later steps, which the run will repeat.
 
         Raises UsageError if `tensorboard` is set and the package is not installed.
         """
@@ -83,7 +83,7 @@ class RunLog:
                 self._events.flush()
 
     def draw(self, maps: SampleMaps | None) -> None:
-        """Write curves.png anew, and maps.png where there are maps."""
+        """Update curves.png, and maps.png if maps are given."""
         rows = read_metrics(self.folder / METRICS)
         columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
         write_bytes(self.folder / CURVES, png_bytes(training_figure(columns), dpi=110))
@@ -96,7 +96,7 @@ class RunLog:
 
 
 def read_metrics(path: Path) -> list[Metrics]:
-    """Return the lines of a metrics.csv that is whole."""
+    """Return the lines of a complete metrics.csv."""
     return [_parse(line) for line in path.read_text("utf-8").splitlines()[1:]]
 
 
@@ -113,9 +113,9 @@ def _parse(line: str) -> Metrics:
 
 
 def _drop_lines_after(step: int, path: Path) -> Path | None:
-    """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left.
+    """Remove the lines of later steps from a metrics.csv, or the whole file if no line is left.
 
-    A file that cannot be read is renamed to a name that is free, which is returned.
+    A file that cannot be read is renamed to an unused name, which is returned.
     """
     try:
         kept = _lines_until(step, path)
@@ -161,7 +161,7 @@ def _open_events(folder: Path, step: int) -> Any:
 
 
 FORMAT = "splinecli-checkpoint-2"
-_COUNTERS_KEY = "clock"  # the name of this entry in checkpoints of every version so far
+_COUNTERS_KEY = "clock"  # the key of this entry in checkpoints of all versions so far
 
 
 @dataclass
@@ -182,7 +182,7 @@ def save_checkpoint(
     counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the whole state of a run: the network with its running average, and the SHA-256 of each pixel set by path.
+    """Write the complete state of a run, with the running average of the weights and the SHA-256 of each pixel set.
 
     Raises OutputError.
     """

@@ -1,6 +1,6 @@
-"""What a run trains on: pixels for LI-Net, NE-Net and the error head, or whole scenes for the refinement net.
+"""Training data of a run: pixels for LI-Net, NE-Net and the error head, or whole scenes for the refinement net.
 
-Pixels come from the pixel generator, from pixel sets, or from mixtures of them.
+Pixels come from the pixel generator, from pixel sets, or from a mixture.
 """
 
 import hashlib
@@ -48,8 +48,8 @@ class MixedSource:
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
     """Split the entries of a set into training and validation entries, scene by scene.
 
-    The scenes with the lowest hashes of their names are for validation. So the choice for one scene hardly depends on
-    the other scenes of the set. A share above 0 gives at least one scene, and one is always left for training.
+    The scenes whose names have the lowest hashes are used for validation, so the choice for one scene hardly depends on
+    the other scenes of the set. A share above 0 selects at least one scene, and always leaves one for training.
     """
     scenes = sorted({entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest())
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
@@ -64,21 +64,21 @@ PixelSource = PixelGenerator | PixelSetSource | MixedSource
 """Draws batches of pixels. Its random generator determines the batches."""
 
 Scenes = dict[str, tuple[PixelSet, list[Entry]]]
-"""By path, the pixel sets of a run, each with its entries for training or for validation."""
+"""The pixel sets of a run by path, each with its entries for training or for validation."""
 
 
 @dataclass(frozen=True)
 class OpenSets:
     """The pixel sets of a run."""
 
-    # training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
+    # training, validation: the scenes for each purpose. A set with a single scene is validated on its training pixels.
     training: Scenes
     validation: Scenes
-    single_scene_sets: tuple[str, ...]  # these sets
+    single_scene_sets: tuple[str, ...]  # the paths of these sets
 
     @property
     def sha256(self) -> dict[str, str]:
-        """The checksum of each set by path."""
+        """The checksum of each set, by path."""
         return {name: pixel_set.sha256 for name, (pixel_set, _) in self.training.items()}
 
 
@@ -114,7 +114,7 @@ def pixel_source(
 
 
 def _split_sets(sets: dict[str, PixelSet], share: float) -> dict[str, tuple[list[Entry], list[Entry]]]:
-    """Return training and validation entries of each set, where no shape is in both.
+    """Return training and validation entries of each set, with no shape in both.
 
     Two sets may contain the same shape. A shape that one of them uses for validation is not used for training.
     """
@@ -136,8 +136,8 @@ VALIDATION_PIXELS = 2048
 VALIDATION_SCENES = 12
 SHOWN_PIXELS = 8
 
-# Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
-# other processes follow it.
+# Random streams of a step. Its shards are numbered from 0. DROPOUT_STREAM is for process 0; the streams of the other
+# processes follow.
 _BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 - 1, 2**31 + 2
 
 
@@ -151,9 +151,9 @@ class SampleMaps(NamedTuple):
 
 
 class PixelTask:
-    """Batches of pixels from the sources of a run: its `source` for training, and those for `validation`."""
+    """Batches of pixels from the sources of a run: `source` for training, and the sources for `validation`."""
 
-    long_start = ""  # what `prepare` does if it takes minutes, in words for people
+    long_start = ""  # message about the work of `prepare` if it takes minutes
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
@@ -167,7 +167,7 @@ class PixelTask:
         self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
+        """Draw the data of process `rank` for the first step of this run, `step`. Only process 0 validates."""
         if rank == 0:
             # At least 64 pixels at a time, because a draw has one source
             pixels = min(max(64, self.config.pixels.capture_pixels), VALIDATION_PIXELS)
@@ -176,7 +176,7 @@ class PixelTask:
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
 
-        Returns each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
+        Returns each shard's pixels and their additional rotations in degrees (P,), and whether all are mirrored.
         """
         config = self.config
         canonical = config.network.is_canonical
@@ -195,7 +195,7 @@ class PixelTask:
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
         """Yield the losses of each of this process's shards of a step's batch."""
         shards, mirrored = self.draw(step)
-        # One shard at a time: its pixels have about equally many lights, so hardly any padding is computed.
+        # One shard at a time: its pixels have similar numbers of lights, so little computation is wasted on padding.
         for batch, turn_deg in shards:
             yield compute_losses(
                 network,
@@ -247,7 +247,7 @@ def _sample(network: SplineNet, batch: PixelBatch, count: int) -> SampleMaps:
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
 ) -> tuple[PixelMaps, Tensor | None, Tensor]:
-    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the frames of the pixels."""
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the pixels' frames."""
     network.eval()
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -257,7 +257,7 @@ def _estimate(
 
 
 class RefinementTask:
-    """Captures of whole scenes, photographed while training goes on; see ScenePool."""
+    """Captures of whole scenes, simulated during training; see ScenePool."""
 
     long_start = "photographing the first captures, for some minutes"
 
@@ -277,7 +277,7 @@ class RefinementTask:
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         config = self.config
         seed = stream_seed(config.seed, rank, _POOL_STREAM)
-        first = -(-step // STEPS_PER_EXAMPLE)  # of the captures, if one is added before step 0 and so on
+        first = -(-step // STEPS_PER_EXAMPLE)  # number of the first capture, with one added before step 0 and so on
         self.pool = self._pool(self.sets.training, network, seed, first=first)
         for _ in range(FIRST_EXAMPLES):
             self.pool.add()
