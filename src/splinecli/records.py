@@ -199,14 +199,16 @@ def in_words(kind: Any) -> str:
     if get_origin(bare) is Union:
         bare = get_args(bare)[0]
     if get_origin(bare) is Literal:
-        return " or ".join(map(repr, get_args(bare)))
+        names = list(map(repr, get_args(bare)))
+        return " or ".join(names) if len(names) < 3 else f"one of {', '.join(names)}"
     if get_origin(bare) in (list, dict):
         whole = "list" if get_origin(bare) is list else "table"
         return f"a {whole}, each {in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
     if bare not in (int, float):
         return {bool: "true or false", str: "a text", Path: "a text"}.get(bare, "a table of settings")
     words, given = "a whole number" if bare is int else "a number", limits(kind)
-    for bound, word in ((given.ge, "from"), (given.gt, "above"), (given.le, "to"), (given.lt, "to below")):
+    lower = "of at least" if given.le is None and given.lt is None else "from"
+    for bound, word in ((given.ge, lower), (given.gt, "above"), (given.le, "to"), (given.lt, "to below")):
         words += "" if bound is None else f" {word} {bound:.10g}"
     return words if given.multiple_of is None else f"{words}, a multiple of {given.multiple_of}"
 

@@ -17,14 +17,14 @@ CASES = {
     "infer X -z": "no option -z. See 'splinecli infer --help'.",
     "infer X --msk": "no option --msk. Did you mean --auto-mask, --maps or --mask? See 'splinecli infer --help'.",
     "prepare -o s --lights 20": "no option --lights. Did you mean --n-lights? See 'splinecli prepare --help'.",
-    "infer X --n-lights abc": "--n-lights is 'abc'; expected a whole number from 3.",
-    "prepare -o s --n-lights 20.5": "--n-lights is '20.5'; expected a whole number from 16.",
-    "prepare -o s --n-lights 4": "--n-lights is '4'; expected a whole number from 16.",
-    "evaluate X --light-noise-deg 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a number from 0.",
+    "infer X --n-lights abc": "--n-lights is 'abc'; expected a whole number of at least 3.",
+    "prepare -o s --n-lights 20.5": "--n-lights is '20.5'; expected a whole number of at least 16.",
+    "prepare -o s --n-lights 4": "--n-lights is '4'; expected a whole number of at least 16.",
+    "evaluate X --light-noise-deg 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a number of at least 0.",
     "infer X --stiffness 2": "--stiffness is now --discontinuity. See 'splinecli infer --help'.",
     "info X --lights-format azel": "--lights-format is now --light-format. See 'splinecli info --help'.",
     "info X --light-frame exchanged": "--light-frame is 'exchanged'; exchanged is now swap-xy.",
-    "infer X --device tpu": "--device is 'tpu'; expected 'auto' or 'cpu' or 'cuda'.",
+    "infer X --device tpu": "--device is 'tpu'; expected one of 'auto', 'cpu', 'cuda'.",
 }
 
 
@@ -37,8 +37,8 @@ def test_usage_errors(arguments, run):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--workers", "0"), "--workers is '0'; expected a number from 1, or auto"),
-        (("--workers", "many"), "--workers is 'many'; expected a number from 1, or auto"),
+        (("--workers", "0"), "--workers is '0'; expected a number of at least 1, or auto"),
+        (("--workers", "many"), "--workers is 'many'; expected a number of at least 1, or auto"),
         (("--workers", "2", "--cluster", "tcp://a:1"), "--workers and --cluster contradict each other"),
         (("--shard", "3/2"), "--shard is 3/2; expected I/N with I from 1 to N"),
         (("--shard", "half"), "--shard is 'half'; expected I/N"),

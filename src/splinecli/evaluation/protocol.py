@@ -55,7 +55,7 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
     if trials < 1:
         raise UsageError(f"--trials is {trials}; expected at least 1")
     if seed < 0:
-        raise UsageError(f"--seed is {seed}; expected a whole number from 0")
+        raise UsageError(f"--seed is {seed}; expected a whole number of at least 0")
 
 
 @dataclass(frozen=True)

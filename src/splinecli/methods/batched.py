@@ -45,7 +45,7 @@ class BatchedEstimator(Estimator):
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
         if batch_size < 1:
-            raise UsageError("batch size is a whole number from 1")
+            raise UsageError("batch size is a whole number of at least 1")
         self.name, self.device, self.batch_size, self._solve = name, device, batch_size, solve
         self.fingerprint = f"{name} {self.precision}"
 

@@ -91,7 +91,7 @@ class Display(Record, frozen=True, kw_only=True):
 def parse_workers(text: str) -> int:
     """Return a number of processes, 0 for "auto". Raises UsageError."""
     if text != "auto" and (not text.isdecimal() or len(text) > 4 or int(text) < 1):
-        raise UsageError(f"--workers is {text!r}; expected a number from 1, or auto")
+        raise UsageError(f"--workers is {text!r}; expected a number of at least 1, or auto")
     return 0 if text == "auto" else int(text)
 
 
