@@ -187,13 +187,13 @@ def find_earlier(
 ) -> dict[str, Any] | None:
     """Return the report in `target` if its results match the capture in `folder` and the options.
 
-    Returns None if there are no results. If an interrupted run left partial results, `warn` is called with a sentence
-    about them.
+    Returns None if there are no results. If an interrupted run left partial results, `warn` receives a sentence
+    about this.
 
     Raises:
         ChangedError: the results belong to another capture or other options.
         InputError: the capture cannot be read.
-        OutputError: `target` and `folder` are the same, so the user's own files may have the names of results.
+        OutputError: `target` is also the capture's folder, where the user's own files may have the names of results.
     """
     try:
         report = read_report(target)
@@ -356,7 +356,7 @@ def worst_exit_code(codes: Iterable[int]) -> int:
 
 
 def expected_bytes(member: Member, options: InferOptions) -> float:
-    """Return the approximate memory in bytes that `infer` needs for a capture; see source_bytes."""
+    """Return the approximate memory in bytes that `infer` needs for a capture. See source_bytes."""
     n_lights = options.n_lights or len(options.light_indices or ())
     return source_bytes(lambda: options.open(member.folder), n_lights)
 

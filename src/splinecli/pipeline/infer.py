@@ -192,8 +192,8 @@ def infer_capture(
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results are written to `options.output`/<capture name>/, where they replace earlier ones (see new_files). No
-    other process may write there in the meantime.
+    The results are written to `options.output`/<capture name>/, replacing earlier ones as new_files does. No other
+    process may write there in the meantime.
 
     Args:
         estimator: the result of `make_method(options)`, which can be reused in a batch to save time.
@@ -253,7 +253,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
-    """Lock the folder for the results of a capture (see held_folder) and yield it. Raises OutputError."""
+    """Lock the folder for the results of a capture with held_folder, and yield it. Raises OutputError."""
     target = Path(options.output) / name
     refuse_link(target)
     with held_folder(target, observer.warn):

@@ -104,9 +104,9 @@ class Workers(Record, frozen=True, kw_only=True):
 
 
 class ClusterOptions(Workers, frozen=True, kw_only=True):
-    """Where the items of a command are done: in this process, others of this machine, or a Dask cluster."""
+    """Where the items of a command are processed: in this process, in other local processes, or on a Dask cluster."""
 
-    # the address of a Dask scheduler, or its scheduler file
+    # the address or the scheduler file of a Dask scheduler
     address: Annotated[str | None, Option("Processes and machines", "ADDRESS|FILE",
         "Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file (needs"
         " the extra 'cluster').", names=("--cluster",))] = None
@@ -136,9 +136,9 @@ HERE = ClusterOptions()
 
 
 class Reading(Record, frozen=True, kw_only=True):
-    """The options of `infer` and `info` that select the files of a capture and how to read them; see the help.
+    """The options of `infer` and `info` that select the files of a capture and how to read them.
 
-    None stands for the default given in the help. Raises UsageError.
+    The help describes each option. None stands for the default given there. Raises UsageError.
     """
 
     mask: Annotated[FileName | None, Option("Input", "FILE",

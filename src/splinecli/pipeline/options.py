@@ -1,4 +1,4 @@
-"""The options of the commands that do not process a single capture, as frozen records; see their help."""
+"""The options of the commands that are not for individual captures, as frozen records. See their help."""
 
 # The options form a table: name, type, panel and kind of value, then the help text.
 # fmt: off
