@@ -163,7 +163,7 @@ class Protocol:
     # typical error of the light directions, with which each trial refines them (see refine_capture). None disables the
     # refinement.
     light_error_deg: float | None = None
-    finds_lights: bool = False  # whether each trial estimates its lights from its images, as in `infer --lights estimate`
+    finds_lights: bool = False  # whether trials estimate their lights from the images, as `infer --lights estimate`
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)

@@ -143,7 +143,7 @@ def plan_capture(
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol, with the numbers of lights and trials in its draws file, and the draws. Raises InputError."""
+    """Return the protocol, with n_lights and trials taken from its draws file, and the draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
     draws_file = read_draws(protocol.draws_file)

@@ -62,7 +62,7 @@ class Trial:
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything that affects the score. The noise depends on seed and number, the pixels on the seed."""
+        """SHA-256 of all that affects the score. The noise depends on seed and number, the pixels on the seed."""
         values = self.record
         del values["capture"]  # only a name in the tables; made_of covers the files themselves
         if self.protocol.light_error_deg is None:

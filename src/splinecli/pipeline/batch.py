@@ -187,8 +187,7 @@ def find_earlier(
 ) -> dict[str, Any] | None:
     """Return the report in `target` if its results match the capture in `folder` and the options.
 
-    Returns None if there are no results. If an interrupted run left partial results, `warn` receives a sentence
-    about this.
+    Returns None if no results exist. If an interrupted run left partial results, `warn` receives a sentence about this.
 
     Raises:
         ChangedError: the results belong to another capture or other options.

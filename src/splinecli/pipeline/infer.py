@@ -68,8 +68,8 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
 def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
     """Return the approximate memory in bytes for a capture, from the first image's header and, if large, the mask.
 
-    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images are read; 0 means
-    all of them.
+    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images are read; 0 reads
+    all images.
     """
     try:
         source = open_source()

@@ -149,7 +149,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     The rest of the report is not checked.
 
     Raises:
-        UnfinishedError: there is no report, or a file is missing or has another size.
+        UnfinishedError: the report or a file is missing, or a file has another size.
         OSError, ValueError, KeyError, TypeError, AttributeError: the report cannot be used.
     """
     if not is_plain(folder / REPORT):

@@ -45,7 +45,7 @@ def render(template: str, **values: object) -> str:
 
 LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
 LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side length
-QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: if the maps exceed the first, a page initially shows maps with the second
+QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page initially shows maps with the second
 
 LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
 
