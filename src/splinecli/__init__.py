@@ -54,7 +54,7 @@ def estimate_normals(
 
     Args:
         images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
-            uint16 values are scaled by their full range; floating-point values are taken as they are.
+            uint16 values are scaled by their full range; floating-point values are not scaled.
         light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
             None estimates them from the images, as `infer --lights estimate` does. See capture.light_errors_deg.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
@@ -68,7 +68,7 @@ def estimate_normals(
             lamps in the same unit, from the middle of the image on the object's mean plane.
         camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the object's width. The
             light directions are then in the frame of its axis. None is an orthographic camera.
-        method: a name of `splinecli infer --method`, such as "spline-net" or "ls"; see splinecli.methods.METHODS.
+        method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See splinecli.methods.METHODS.
         as_stored: use the image values unchanged. By default, lens blur is removed, saturated observations are
             restored and unknown light intensities are estimated.
         white_level: the value from which an observation is saturated, in the unit of the images. None detects it for
@@ -85,7 +85,7 @@ def estimate_normals(
     Returns:
         A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the mask and zero
         outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None
-        where the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
+        if the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
         others that have an error head); and capture, with the observations and with warnings that you should read.
 
     Raises:

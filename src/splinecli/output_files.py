@@ -1,7 +1,7 @@
 """The files that splinecli writes for users: their names, and one row of MAPS for each optional map of `infer`.
 
 The row determines how the map is computed, written, read, drawn and shown, how much memory it needs, and that its
-pictures are not read as photographs. Functions are given by name, because their modules are above this one.
+pictures are not read as photographs. Functions are given by name, because their modules belong to higher layers.
 """
 
 from dataclasses import dataclass

@@ -54,7 +54,7 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute. Attributes that depend on the options are created now, because these imports are slow."""
+        """Return an attribute, creating it now if it depends on the options, because their imports are slow."""
         return getattr(self._made, name) if name in ("params", "callback") else super().__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -49,7 +49,7 @@ def report_interruption() -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but not during an import: trimesh, for example, continues after any exception."""
+    """Raise KeyboardInterrupt, or defer it until an import is done: trimesh, for one, continues after any exception."""
     while frame is not None:
         if frame.f_code.co_filename == _IMPORTS:
             DEFERRED.set()
