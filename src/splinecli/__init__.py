@@ -20,7 +20,7 @@ __version__ = "0.3.0"
 
 __all__ = ["__version__", "estimate_normals", "integrate_normals"]
 
-# Everything else is imported inside the functions. PyTorch takes a second or more to load.
+# Everything else is imported inside the functions, because PyTorch takes a second or more to load.
 
 
 def estimate_normals(
@@ -45,38 +45,38 @@ def estimate_normals(
 ) -> NormalEstimate:
     """Estimate surface normals from images of one object under different lights.
 
-    The images are prepared, checked against the lights, and the normals estimated exactly as `splinecli infer` does.
-    Warnings that an input is probably wrong, such as light directions in another frame, are also issued with Python's
-    module `warnings`.
+    The images are prepared and checked against the lights, and the normals are estimated, exactly as in
+    `splinecli infer`. Warnings that an input is probably wrong, such as light directions in another frame, are also
+    issued with Python's `warnings` module.
 
     The first call limits PyTorch's threads to the cores that the process may use. If other processes keep the machine
     busy, also set the environment variable OMP_WAIT_POLICY to passive before PyTorch is imported.
 
     Args:
         images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
-            uint16 values are scaled by their full range; floating-point values are taken as they are.
+            uint16 values are scaled by their full range; floating-point values are not scaled.
         light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
-            None finds them from the images, as `infer --lights estimate` does; see capture.light_errors_deg.
+            None estimates them from the images, as `infer --lights estimate` does. See capture.light_errors_deg.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
-            None takes all pixels.
-        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
-            that they differ.
-        first_light: where light_directions is None, the side of the image from which the first light comes, such as
-            "left" or "upper-left", or its azimuth in degrees, counter-clockwise from the right. It is needed for an
-            object without outline.
+            None uses all pixels.
+        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown; they are then estimated if the images
+            show that they differ.
+        first_light: if light_directions is None, the side of the image from which the first light comes, such as
+            "left" or "upper-left", or its azimuth in degrees, counter-clockwise from the right. It is required if the
+            images show no outline of the object.
         pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
             lamps in the same unit, from the middle of the image on the object's mean plane.
-        camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is near, compared with the object's width. The
+        camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the object's width. The
             light directions are then in the frame of its axis. None is an orthographic camera.
-        method: a name of `splinecli infer --method`, such as "spline-net" or "ls"; see splinecli.methods.METHODS.
-        as_stored: use the values of the images alone. By default, lens blur is removed, saturated observations
-            are restored and unknown light intensities are estimated.
-        white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
-            integer images; floating-point images then have none.
+        method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See splinecli.methods.METHODS.
+        as_stored: use the image values unchanged. By default, lens blur is removed, saturated observations are
+            restored and unknown light intensities are estimated.
+        white_level: the value from which an observation is saturated, in the unit of the images. None detects it for
+            integer images; floating-point images then have no white level.
         weights: name or file of a network's weights. None is the method's own.
         rotations: number of rotations of the lights whose normals a network averages. None is the method's own.
-        distil: let a small network learn the method on a sample of the pixels and estimate the rest. False uses the
-            method on every pixel; None distils for 100,000 pixels and more.
+        distil: approximate the method by a small network, trained on a sample of the pixels, for the remaining pixels.
+            False uses the method on every pixel; None distils for 100,000 pixels and more.
         batch_size: pixels per batch. None is the method's own.
         device: where to compute; "auto" is a CUDA GPU if there is one.
         precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
@@ -85,7 +85,7 @@ def estimate_normals(
     Returns:
         A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the mask and zero
         outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None
-        where the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
+        if the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
         others that have an error head); and capture, with the observations and with warnings that you should read.
 
     Raises:
@@ -155,7 +155,7 @@ def integrate_normals(
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
         mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
+        discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous surface.
 
     Raises:
         splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is out of range.

@@ -1,7 +1,7 @@
 """The warnings of a capture: one row of the table for each kind, with a stable code for programs.
 
-A check or a reader makes a warning of its row, with a sentence for people. The table of docs/troubleshooting.md, and
-what `--strict` refuses, follow from the rows (docs/make_tables.py).
+A check or a reader creates a warning from its row, with a human-readable sentence. The rows also generate the table in
+docs/troubleshooting.md (docs/make_tables.py), and determine the warnings that `--strict` turns into errors.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class WarningKind:
 
     code: a name that stays the same when the sentences change.
     meaning, remedy: for the documentation, in Markdown.
-    severity: "error" says that an input is probably wrong. With --strict it is an error.
+    severity: "error" means that an input is probably wrong; with --strict, the warning becomes an error.
     """
 
     code: str
@@ -33,8 +33,8 @@ class WarningKind:
 class CaptureWarning:
     """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
-    error_deg: the median angle in degrees by which normals are wrong if the warning is right. The confidence falls by
-        it. None if the normals are not concerned, or the confidence accounts for the fault in another way.
+    error_deg: the median angular error of the normals in degrees if the warning is correct. The confidence is lowered
+        accordingly. None if the normals are not affected, or the confidence accounts for the fault in another way.
     """
 
     kind: WarningKind
@@ -267,7 +267,7 @@ SATURATED_SHARE = 0.01  # share of saturated observations above which the captur
 
 
 def mask_inverted(name: str) -> CaptureWarning:
-    """Say that a mask is probably black on the object."""
+    """Warn that a mask is probably black on the object."""
     text = f"{name} leaves out a bright area in the middle and keeps what surrounds it: it is probably inverted."
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
 
@@ -279,7 +279,7 @@ def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
 
 
 def estimated_lights(errors_deg: Doubles) -> CaptureWarning:
-    """Say that the light directions were found from the images, and with which expected errors (F,) in degrees."""
+    """Report that the light directions were estimated from the images, with expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,
         f"The light directions were estimated from the images. They are expected to be wrong by {errors_deg.mean():.0f}"

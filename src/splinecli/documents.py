@@ -1,4 +1,4 @@
-"""The documents that commands write and print as JSON, declared once: docs/reports.schema.json is made of them."""
+"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from them."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ class SurfaceFacts(Document):
 
 
 class EstimateReport(Document):
-    """What a report of infer says of the estimate."""
+    """The part of a report of infer that describes the estimate."""
 
-    schema: Literal[3]  # rises when a field changes its meaning
+    schema: Literal[3]  # incremented when the meaning of a field changes
     capture: str
     method: str
     weights: UsedWeights | None
@@ -147,7 +147,7 @@ class SurfaceReport(SurfaceFacts):
 
 
 class ProtocolReport(Document):
-    """How an evaluation was done. Several evaluations have lists of what they differ in."""
+    """How an evaluation was done. With several evaluations, the settings that differ are lists."""
 
     n_lights: DrawnLights | list[DrawnLights]
     trials: Count
@@ -217,7 +217,7 @@ class Results(Document):
 
 
 class Failure(Document):
-    """In place of a report; only infer names the capture."""
+    """Printed instead of a report after an error; only infer includes the name of the capture."""
 
     error: str
     exit_code: Count

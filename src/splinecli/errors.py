@@ -1,4 +1,4 @@
-"""The errors that splinecli raises on purpose. Each has an exit code, and a hint that says what to do."""
+"""The errors that splinecli raises on purpose. Each has an exit code and a hint with a remedy."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -6,9 +6,9 @@ from typing import Any
 
 
 def printable(text: object) -> str:
-    """Return the text in one line, with escapes such as \\n for all characters that are not printable.
+    """Return the text on one line, with escapes such as \\n for all non-printable characters.
 
-    Names of files may contain anything, also what moves a terminal's cursor or forges a line.
+    File names may contain any character, including control sequences that move the cursor or forge a line.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in str(text))
 
@@ -17,10 +17,10 @@ class SplinecliError(Exception):
     """A failure that one message explains: "PATH:LINE: PROBLEM. HINT.".
 
     Args:
-        problem: what was found and what was expected, as one sentence without the final full stop.
-        path: the file or folder that causes the failure, if there is one.
-        line: the line of that file, counted from 1, if there is one.
-        hint: what the user can do, as one sentence without the final full stop.
+        problem: the value found and the value expected, as one sentence without the final full stop.
+        path: the file or folder that causes the failure, if any.
+        line: the line in that file, counted from 1, if any.
+        hint: the remedy, as one sentence without the final full stop.
     """
 
     exit_code = 1

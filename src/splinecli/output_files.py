@@ -1,7 +1,7 @@
-"""The files that splinecli writes for people: their names, and one row of MAPS for each map that `infer` may add.
+"""The files that splinecli writes for users: their names, and one row of MAPS for each optional map of `infer`.
 
-What the row says decides how the map is made, written, read back, drawn and shown, how much memory it takes, and that
-its pictures are no photographs. The functions are named, because they need rooms above this one.
+The row determines how the map is computed, written, read, drawn and shown, how much memory it needs, and that its
+pictures are not read as photographs. Functions are given by name, because their modules belong to higher layers.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ FOUND_LIGHTS = FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = (
     "light_intensities.txt",
     "lights.png",
 )
-"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
+"""Files with the lights estimated by `infer`. If results and capture share a folder, they may be the user's own."""
 
 PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
     "calibration.png",
@@ -35,23 +35,23 @@ PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
 )
 """Pictures that the other commands write."""
 
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values that are white in the pictures, by default
-BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values shown as white in the pictures by default
+BYTES_OF_SURFACE = 600  # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputMap:
     """A row of MAPS.
 
-    name: in --maps; the files have it with each of the suffixes.
+    name: the name in --maps; the file names consist of it and each of the suffixes.
     make: "module:function" from a capture's source, its NormalEstimate and a progress function, called after each
-        image, to float32 values (H, W) or (H, W, C), or None where there are none.
-    content: for the documentation. unit: what TIFF and EXR files say of the values.
-    picture: "module:function" from values and mask, and with a scale from this, to an 8-bit picture.
-    scale: the value that is white in the picture, unless the user gives another; scale_text: what its file says of it.
-    caption: below the picture on the page, which has this map even if --maps does not name it; "" leaves it out.
+        image, to float32 values (H, W) or (H, W, C), or None if the map is not available.
+    content: for the documentation. unit: the description of the values in TIFF and EXR files.
+    picture: "module:function" from values and mask, and the scale if the map has one, to an 8-bit picture.
+    scale: the value shown as white in the picture by default; scale_text: the description of the scale in the file.
+    caption: below the picture on the page, which shows this map even if --maps does not name it; "" leaves it out.
     needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
-    bytes_per_pixel, bytes_per_observation: of memory. A map that takes any is made before the others are written.
+    bytes_per_pixel, bytes_per_observation: memory. Maps that need any are computed before the others are written.
     """
 
     name: str
@@ -70,7 +70,7 @@ class OutputMap:
 
     @property
     def files(self) -> dict[str, str]:
-        """The names of its files by suffix."""
+        """The names of the map's files, by suffix."""
         return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
 
 
@@ -137,7 +137,7 @@ SCALED_MAPS = tuple(row.name for row in _ROWS if row.scale is not None)
 
 
 def own_files() -> list[str]:
-    """Return the names of all files that `infer` and `integrate` may write into a folder, but FOUND_LIGHTS."""
+    """Return the names of all files that `infer` and `integrate` may write to a folder, except FOUND_LIGHTS."""
     return [
         *NORMALS.values(),
         ERROR_MAP,

@@ -24,7 +24,7 @@ PANELS = (
     *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights", "Light intensities"),
     *("Method", "Output", "Speed", "Processes and machines"),
 )
-"""The panels of the help, in their order."""
+"""The panels of the help, in order."""
 
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
@@ -42,9 +42,9 @@ Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 class Option:
     """How a field is given on the command line: as `--field-name`, or by `names`.
 
-    panel: one of PANELS. metavar: stands for the value; "" for a flag or a choice. default: what the help says of a
-    default of None. complete: the values that a shell offers, or a function that returns them. parse: makes the field's
-    value of a text, or of each where the option may be `repeated`. items: the names that may stand in a list "a,b".
+    panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default: text for a default of
+    None in the help. complete: the values for shell completion, or a function that returns them. parse: converts a text
+    to the field's value, or each text if the option may be `repeated`. items: the names allowed in a list "a,b".
     """
 
     panel: str
@@ -59,11 +59,11 @@ class Option:
 
     @property
     def is_argument(self) -> bool:
-        """Whether it is given by its place."""
+        """Whether it is a positional argument."""
         return self.panel == ARGUMENTS
 
     def value_of(self, given: Any, title: str) -> Any:
-        """Return the field's value from what Typer gives. Raises UsageError."""
+        """Convert Typer's value to the field's value. Raises UsageError."""
         if self.items:
             names = tuple(item.strip() for item in given.split(",") if item.strip())
             for name in names:
@@ -79,7 +79,7 @@ class Option:
 
 
 class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A frozen record of options, whose fields are checked. Raises UsageError for a wrong value."""
+    """A frozen record of options, whose fields are validated. Raises UsageError for an invalid value."""
 
     def __post_init__(self) -> None:
         for name, kind in field_types(type(self)).items():
@@ -89,7 +89,7 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 check_one_of(name.removesuffix("s"), item, option.items)  # type: ignore[union-attr]
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with other values of some fields."""
+        """Return a copy with new values for some fields."""
         return replace(self, **changes)
 
     def as_dict(self) -> dict[str, Any]:
@@ -99,12 +99,12 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record that `as_dict` wrote. Raises UsageError for an unknown name or a wrong value."""
+        """Return the record from the result of `as_dict`. Raises UsageError for an unknown name or an invalid value."""
         return cls(**settings(cls, values, "option", UsageError))
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """Take the record's values of a command line out of `given`, and return the record. Raises UsageError."""
+        """Remove the record's command-line values from `given`, and return the record. Raises UsageError."""
         values: dict[str, Any] = {}
         for name, kind in field_types(cls).items():
             option = option_of(kind)
@@ -132,9 +132,9 @@ def field_types(record: type) -> dict[str, Any]:
 
 
 def settings(record: type, values: Mapping[str, Any], noun: str, error: type[SplinecliError]) -> dict[str, Any]:
-    """Return values from JSON or TOML in the types of the fields of a record or dataclass.
+    """Convert values from JSON or TOML to the types of the fields of a record or dataclass.
 
-    Raises the error for an unknown name or a wrong value; `noun` stands before the name in its message.
+    Raises the given error for an unknown name or an invalid value; `noun` precedes the name in its message.
     """
     kinds = field_types(record)
     for name in values:
@@ -144,9 +144,9 @@ def settings(record: type, values: Mapping[str, Any], noun: str, error: type[Spl
 
 
 def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True) -> Any:
-    """Return a value in a type, such as a tuple for a list. Raises the error, which begins with the title.
+    """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins with the title.
 
-    If it is not strict, a text may stand for a number.
+    Unless `strict` is set, numbers may be given as text.
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
@@ -178,7 +178,7 @@ def limits(kind: Any) -> Meta:
 
 
 def _metadata(kind: Any) -> Iterator[Any]:
-    """Yield what is annotated to a type and its parts."""
+    """Yield the annotations of a type and its parts."""
     yield from getattr(kind, "__metadata__", ())
     for part in get_args(kind):
         yield from _metadata(part)
@@ -194,7 +194,7 @@ def plain(kind: Any) -> Any:
 
 
 def in_words(kind: Any) -> str:
-    """Return what a value of a type is, such as "a number from 0 to 1"."""
+    """Describe the values of a type, such as "a number from 0 to 1"."""
     bare = plain(kind)
     if get_origin(bare) is Union:
         bare = get_args(bare)[0]
@@ -218,7 +218,7 @@ def _each(value: Any) -> tuple[Any, ...]:
 
 
 def number_of(kind: Any) -> type | None:
-    """Return int or float for numbers, and for None and lists of them."""
+    """Return int or float for numbers, optional numbers and lists of numbers."""
     found = plain(kind)
     while get_args(found) and get_origin(found) is not Literal:
         found = get_args(found)[0]
@@ -226,7 +226,7 @@ def number_of(kind: Any) -> type | None:
 
 
 def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma."""
+    """Return the completions of a list "a,b": the typed items, followed by each possible item after the last comma."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")

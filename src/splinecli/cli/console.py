@@ -1,8 +1,8 @@
-"""What people and programs read: reports, messages, tables and progress.
+"""Output for users and programs: reports, messages, tables and progress.
 
-Errors become one message and an exit code, and JSON documents among those of a command. Typer and click name the errors
-of their parser, such as an unknown option or a word in place of a number, differently from version to version. Only
-attributes of these errors are relied on. One without a known attribute keeps its text.
+Each error becomes one message and an exit code and, with JSON output, also a document. Typer and click change the names
+of their parser errors, such as an unknown option or a word instead of a number, from version to version. We therefore
+rely only on the attributes of these errors. An error without a known attribute keeps its text.
 """
 
 import json
@@ -22,10 +22,10 @@ from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer
 
-DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
+DEFECT = "this is a defect of splinecli; please report it with the lines above."  # for unexpected errors
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
-ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for invalid arguments
 _SYNTAX = (
     (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
     (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
@@ -53,16 +53,16 @@ def explain(error: Exception) -> tuple[str, int]:
 
 
 def error_document(error: Exception) -> dict[str, Any]:
-    """Return {"error", "exit_code"}, which stand in place of a report."""
+    """Return {"error", "exit_code"}, the document that replaces a report."""
     message, exit_code = explain(error)
     return {"error": message, "exit_code": exit_code}
 
 
 @contextmanager
 def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that prints a document of `infer`, which has one for each capture, as soon as that ends.
+    """Yield a function that prints the documents of `infer`, one for each capture, as soon as the capture is finished.
 
-    Each is a line, or an item of one list. The last is that of an error that ends the command.
+    Each document is a line, or an item of a single list. An error that ends the command is printed last.
     """
     is_empty = True
 
@@ -86,7 +86,7 @@ def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[di
 
 
 def _usage_message(error: Any) -> str:
-    """Return the message for a usage error of click: what was found, what was expected, and where help is."""
+    """Return the message for click's usage error, with the value found, the value expected, and a pointer to help."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
     text = _unknown_name(error) or error.format_message()
@@ -113,7 +113,7 @@ def _suggestion(names: list[str]) -> str:
     return f" Did you mean {listed(names)}?" if any(names) else ""
 
 
-LINE_SECONDS = 30.0  # seconds between two lines of progress where stderr is not a terminal
+LINE_SECONDS = 30.0  # seconds between two progress lines if stderr is not a terminal
 
 
 def print_report(report: dict[str, Any], *lines: str, as_json: bool, quiet: bool) -> None:
@@ -132,9 +132,9 @@ def print_lines(text: str) -> None:
 
 
 class Messages(Observer):
-    """Writes for people, on stderr. With `quiet` it writes nothing.
+    """Writes human-readable messages to stderr, or nothing with `quiet`.
 
-    On a terminal, progress is a bar. Elsewhere it is a line every LINE_SECONDS.
+    On a terminal, progress is shown as a bar, elsewhere as one line every LINE_SECONDS.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -150,7 +150,7 @@ class Messages(Observer):
         self.say(f"splinecli: warning: {message}")
 
     def error(self, message: str) -> None:
-        """Print a line that begins with "splinecli:", with `quiet` as well."""
+        """Print a line that begins with "splinecli:", even with `quiet`."""
         print(f"splinecli: {printable(message)}", file=sys.stderr)
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:
@@ -214,7 +214,7 @@ def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]
         TextColumn("{task.fields[speed]}", markup=False),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    # A summary that goes to a file or a pipe must not land in the bar's stream.
+    # A summary for a file or a pipe must not be written to the progress bar's stream.
     own = sys.stdout.isatty()
     with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=own) as bar:
         task = bar.add_task(printable(label), total=total, note="", speed="")

@@ -42,9 +42,9 @@ COMMANDS = {each.__name__.replace("_", "-"): (each, module) for module, part in 
 
 
 class Command(TyperCommand):
-    """A command that expands `~` in its arguments, and makes its options when they are asked for.
+    """A command that expands `~` in its arguments, and creates its options on demand.
 
-    With --json, a command that fails prints a document on stdout as well: {"error", "exit_code"}.
+    With --json, a command that fails also prints a document on stdout: {"error", "exit_code"}.
     """
 
     @cached_property
@@ -54,12 +54,12 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute. Those that follow from the options are made now, as the options import much."""
+        """Return an attribute, creating it now if it depends on the options, because their imports are slow."""
         return getattr(self._made, name) if name in ("params", "callback") else super().__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
-        wants_json, wants_lines = JSON in args, JSON_LINES in args  # the parser takes them out of the list
+        """Parse the arguments. The context is added to parser errors, so that the message names the command."""
+        wants_json, wants_lines = JSON in args, JSON_LINES in args  # the parser removes them from the list
         try:
             return super().parse_args(ctx, args)
         except ParserError as error:
@@ -90,18 +90,18 @@ class Command(TyperCommand):
     def _run(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except EOFError as error:  # click takes it for an interruption by the user
+        except EOFError as error:  # click would treat it as an interruption by the user
             raise RuntimeError("unexpected end of a file") from error
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return what a word may become, each with a line of help: shells take a second line for another word."""
+        """Return the completions of a word, each with one line of help: shells treat a second line as another word."""
         items = super().shell_complete(ctx, incomplete)
         for item in items:
             item.help = textwrap.shorten(item.help or "", HINT_WIDTH, placeholder=" ...")
         return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line, without the braces that Typer sets about arguments."""
+        """Return the parts of the usage line, without the braces that Typer puts around arguments."""
         return [piece.translate({ord(brace): None for brace in "{}"}) for piece in super().collect_usage_pieces(ctx)]
 
     def get_help_option(self, ctx: Any) -> Any:
@@ -163,8 +163,8 @@ def main(args: Sequence[str] | None = None) -> int:
     # takes cores from the thread that computes. PyTorch reads the variable when it is first imported.
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    logging.disable()  # logs of libraries, such as Dask's, are no messages for users
-    warnings.filterwarnings("ignore", module="distributed")  # other versions on workers; see Work.enter
+    logging.disable()  # logs of libraries, such as Dask, are not meant for users
+    warnings.filterwarnings("ignore", module="distributed")  # about other versions on workers. See Work.enter
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)
@@ -208,7 +208,7 @@ class UntilClosed:
             return len(text)
 
     def flush(self) -> None:
-        """Write what is buffered."""
+        """Flush the buffer."""
         try:
             self._stream.flush()
         except BrokenPipeError:
@@ -218,14 +218,14 @@ class UntilClosed:
         return getattr(self._stream, name)
 
     def _mute(self) -> None:
-        """Send the stream to the null device, with what its buffer still has."""
+        """Redirect the stream, including its buffered output, to the null device."""
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, self._stream.fileno())
         os.close(null)
 
 
 def _repair_streams() -> None:
-    """Make streams usable that are closed (`>&-`) or cannot hold every character (an ASCII locale)."""
+    """Repair streams that are closed (`>&-`) or cannot encode every character (an ASCII locale)."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -237,8 +237,8 @@ def _repair_streams() -> None:
 def _apart(stream: TextIO) -> TextIO:
     """Return the stream stderr with a file descriptor of its own.
 
-    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see native_stderr). Other
-    threads can print meanwhile.
+    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see native_stderr). With
+    its own descriptor, other threads can still print in the meantime.
     """
     if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != 2:
         return stream

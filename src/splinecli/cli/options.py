@@ -1,4 +1,4 @@
-"""Commands for Typer from functions of records: an option for each field, which is declared there alone."""
+"""Build Typer commands from functions that take records, with an option for each field of a record."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from splinecli.records import PANELS, Option, Record, complete_list, field_types
 
 
 def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
-    """Return a function for Typer that takes the options of a function's records, and calls it with the records.
+    """Return a function for Typer that accepts the options of a function's records, and calls it with the records.
 
-    The module has the records. It is imported here, as it takes time that the help of other commands does not need.
+    The module defines the records. It is imported here, so that it does not slow down the help of other commands.
     """
     records: dict[str, type[Record]] = {}
     parameters = []
@@ -48,7 +48,7 @@ def help_of(function: Callable[..., object]) -> str:
 
 
 def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
-    """Yield name, option, annotation and default of each field that has an option."""
+    """Yield the name, option, annotation and default of each field that has an option."""
     defaults = {field.name: field.default for field in fields(record)}
     for name, kind in field_types(record).items():
         option = option_of(kind)
@@ -59,7 +59,7 @@ def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
 
 
 def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Parameter:
-    """Return the parameter of a field for Typer. Texts become numbers and lists in Record.from_arguments."""
+    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and lists."""
     typed, metavar, complete = plain(kind), option.metavar, option.complete
     choices = next((get_args(part) for part in (typed, *get_args(typed)) if get_origin(part) is Literal), ())
     if choices:

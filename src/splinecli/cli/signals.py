@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, which job schedulers send, end the process with exit code 130; SIGTERM within two seconds."""
+"""End the process with exit code 130 on Ctrl-C and SIGTERM (sent by job schedulers), SIGTERM within two seconds."""
 
 import os
 import signal
@@ -11,9 +11,9 @@ INTERRUPTED = 130  # exit code of an interrupted process
 GRACE_SECONDS = 1.5  # time that the command has to clean up
 
 
-TOLD = threading.Event()  # set when the command tells of the interruption itself, so that it is told once
-DEFERRED = threading.Event()  # set when a signal came during an import, which must end first
-_IMPORT_SECONDS = 0.05  # time between two looks at whether an import is done
+TOLD = threading.Event()  # set when the command reports the interruption itself, to avoid a second message
+DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
+_IMPORT_SECONDS = 0.05  # time between two checks of whether an import is finished
 _IMPORTS = "<frozen importlib._bootstrap>"
 
 
@@ -21,7 +21,7 @@ def end_on_signals() -> None:
     """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM; end the process if SIGTERM does not end it.
 
     Python delivers a signal only between two of its instructions. One call into a library may take minutes, and an
-    exception in a callback of a library is lost. Another thread learns of the signal at once.
+    exception in a callback of a library is lost. A separate thread is notified of the signal immediately.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
@@ -35,7 +35,7 @@ def end_on_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore SIGTERM and Ctrl-C from now on: the work is done, and only its exit code is still to be told."""
+    """Ignore SIGTERM and Ctrl-C from now on, because the work is done and only the exit code remains to be returned."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
 
@@ -49,7 +49,7 @@ def report_interruption() -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but during an import only afterwards: trimesh, for one, goes on after any exception."""
+    """Raise KeyboardInterrupt, or defer it until an import is done: trimesh, for one, continues after any exception."""
     while frame is not None:
         if frame.f_code.co_filename == _IMPORTS:
             DEFERRED.set()

@@ -1,6 +1,6 @@
 """The files that an evaluation writes: results.json, results.csv, tables, plots, and a report as one HTML file.
 
-All functions take one evaluation, or several of the same methods that differ in n_lights, light_noise_deg or both.
+All functions take one evaluation, or several with the same methods that differ in n_lights, light_noise_deg or both.
 """
 
 import csv
@@ -44,7 +44,7 @@ from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
 
-_MOST_SENTENCES = 3  # pairs, those of three methods; more pairs are easier to read in a matrix
+_MOST_SENTENCES = 3  # pairs, as with three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
 _RESTORED = "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does"
 _AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
@@ -53,7 +53,7 @@ Mark = Literal["", "star", "best"]
 
 
 class Cell(NamedTuple):
-    """A table's cell: its text, a remark in smaller type, and a mark. "best" is a star and a colour."""
+    """A table's cell: its text, a remark in smaller type, and a mark. "best" adds a star and a colour."""
 
     text: str
     remark: str = ""
@@ -66,7 +66,7 @@ Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:
     """Return the report of one evaluation, or of several that differ in the lights or the light noise.
 
-    `figures` are pairs of a caption, which is also the alternative text, and a PNG; `notes` sentences about the
+    `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are sentences about the
     captures.
     """
     first = evaluations[0]
@@ -131,7 +131,7 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
-    """Return a table of methods by evaluations: the last column of each evaluation's table."""
+    """Return a table of methods by evaluations, made from the last column of each evaluation's table."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
         columns.append([Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])])
@@ -156,7 +156,7 @@ def _error_table(evaluation: Evaluation) -> Table:
 
 
 def _seconds_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures: seconds for each trial."""
+    """Return a table of methods by captures: seconds per trial."""
     seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
     body = [
         [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
@@ -166,7 +166,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
-    """Return a table of the MAE of the row's method minus that of the column's; a mark where they differ."""
+    """Return a table of MAE differences, row method minus column method; significant ones are marked."""
     cells = {}
     for c in comparisons:
         for row, column, difference_deg in (
@@ -209,15 +209,15 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-_DIGITS = 4  # behind the point, of degrees and seconds
-_P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
+_DIGITS = 4  # decimal places of degrees and seconds
+_P_DIGITS = 3  # significant digits, because p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 
 
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
-    """Return plots of the error against what the evaluations differ in: captions and PNGs by the names of files."""
+    """Return plots of the error against each setting that varies, as captions and PNGs by file name."""
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
         return plots
@@ -231,9 +231,9 @@ def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes
 def write_results(
     output: Path, evaluations: Sequence[Evaluation], figures: Sequence[CaptureFigure] | None
 ) -> dict[str, Any]:
-    """Write all files in place of those of an earlier evaluation (see new_files). The caller holds the folder.
+    """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the folder.
 
-    Without `figures`, those of an earlier evaluation stay. Returns the content of results.json.
+    If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of results.json.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
     shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
@@ -313,7 +313,7 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _as_text_cell(value: Any) -> Any:
-    """Return a value as a cell of one line that no spreadsheet takes for a formula: an apostrophe marks it as text."""
+    """Return a value as a one-line cell; an apostrophe marks it as text if a spreadsheet could read a formula."""
     if not isinstance(value, str):
         return value
     text = printable(value)
@@ -360,7 +360,7 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     averages = [{method: _rounded(value) for method, value in e.averages.items()} for e in evaluations]
     if len(evaluations) == 1:
         return dict(averages[0])
-    # The values in which the evaluations differ: "10", "all"; "0", "2.5"; or both, "10, 2.5".
+    # The values that differ between the evaluations: "10", "all"; "0", "2.5"; or both, "10, 2.5".
     lights = [str(lights_value(e.protocol)) for e in evaluations]
     noise = [f"{e.protocol.light_noise_deg:g}" for e in evaluations]
     differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]

@@ -1,8 +1,8 @@
 """Figures of evaluations: the error against a setting, and maps and observation maps of single captures.
 
-Plots of the error against the setting in which evaluations differ: the number of lights or the light noise. All
-functions take several evaluations of the same methods. They plot only the captures that all evaluations scored, so that
-every point of an average stands for the same captures.
+The error is plotted against the setting that differs between the evaluations: the number of lights or the light noise.
+All functions take several evaluations of the same methods. They plot only the captures that all evaluations scored, so
+that every point of an average covers the same captures.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 MOST_CAPTURES = 4
-"""Number of captures up to which each has a panel. With more, only the average has one, so that it can be read."""
+"""Largest number of captures with a panel each. With more, only the average is plotted, to keep the figure legible."""
 
 _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
@@ -44,9 +44,9 @@ _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0
 def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
     """Return a PNG of the error against the number of lights K, on a logarithmic axis.
 
-    Each capture has a panel, and so has their average; with one capture, or more than MOST_CAPTURES, there is only the
-    panel of the average. "all" is plotted at the capture's number of lights; in the panel of the average, at the
-    mean number. If the light noise differs too, each of its values has its own dashes.
+    Each capture has a panel, and so does their average; with one capture, or more than MOST_CAPTURES, only the average
+    has a panel. "all" is plotted at the capture's number of lights, and in the panel of the average at the mean number.
+    If the light noise also varies, each of its values has its own dash pattern.
     """
     return _curves(
         evaluations,
@@ -61,7 +61,7 @@ def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
 def light_noise_curves(evaluations: Sequence[Evaluation]) -> bytes:
     """Return a PNG of the error against the light noise, with the panels of lights_curves.
 
-    Where the number of lights differs too, each number has its own dashes.
+    If the number of lights also varies, each number has its own dash pattern.
     """
     return _curves(
         evaluations,
@@ -84,9 +84,9 @@ def _curves(
 ) -> bytes:
     """Return the panels side by side as PNG, with one curve for each method and series, and one legend for all.
 
-    A curve has a band of one standard deviation to either side. Its colour and marker show the method, its dashes the
-    series. `x` gives an evaluation's place on a capture's x axis, `tick` the label there, `series` the name of its
-    curves.
+    Each curve has a band of one standard deviation on either side. Its colour and marker indicate the method, its
+    dashes the series. `x` returns an evaluation's position on a capture's x axis, `tick` the label there, and `series`
+    the name of its curves.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -144,7 +144,7 @@ def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, fl
 
 
 def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> None:
-    """Set ticks, in rising order, at the points. A label that would overlap the one before it is left out."""
+    """Set ticks at the points, in ascending order. A label that would overlap the previous one is left out."""
     from matplotlib.ticker import NullLocator
 
     if logarithmic:
@@ -153,7 +153,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     span = max(place.values()) - min(place.values())
     labels, last = [], -math.inf
     for x, position in place.items():
-        fits = position - last > 0.045 * span  # share of the axis: labels that are closer would overlap
+        fits = position - last > 0.045 * span  # fraction of the axis; labels closer than this would overlap
         labels.append(ticks[x] if fits else "")
         last = position if fits else last
     axes.set_xticks(list(place), labels)
@@ -161,7 +161,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
 
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
-"""Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
+"""Percentiles of SPLINE-Net's errors at which pixels are shown by default."""
 
 MAPS = "_observation_maps"
 
@@ -183,17 +183,17 @@ def capture_figures(
     pixels: Sequence[tuple[int, int]],
     advance: Callable[[float], object],
 ) -> list[CaptureFigure]:
-    """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
+    """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one of single pixels.
 
-    Under near lamps, or with a camera matrix, there is none of pixels. All pixels in the mask are estimated, also where
-    the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has
-    no ground truth.
+    The figure of single pixels is omitted under near lamps or with a camera matrix. All pixels in the mask are
+    estimated, even if the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or
+    UsageError if a pixel has no ground truth.
 
     Args:
         name: name of the capture in the tables.
         stem: stem of the figures' file names.
-        pixels: (row, column) of the pixels whose observation maps are shown; for none, those at SHOWN_PERCENTILES.
-        advance: called with the share of the work that was just done.
+        pixels: (row, column) of the pixels whose observation maps are shown; if empty, pixels at SHOWN_PERCENTILES.
+        advance: called with the fraction of the work just completed.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)
@@ -202,7 +202,7 @@ def capture_figures(
     steps = 1 + len(estimators)
     stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps), as_stored=protocol.as_stored)
     capture = TrialSource(stored).see(trial)
-    assert capture.ground_truth is not None  # or there is no first trial
+    assert capture.ground_truth is not None  # otherwise there would be no first trial
     normals: dict[str, NDArray[np.float32]] = {}
     errors_deg: dict[str, NDArray[np.float32]] = {}
     for estimator in estimators:
@@ -211,13 +211,13 @@ def capture_figures(
         )
         assert estimate.error_map_deg is not None
         normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
-    # A title lists at most so many lights.
+    # The largest number of lights listed in a title.
     listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
     network = next((each for each in estimators if has_observation_maps(each.name)), None)
-    # Under near lamps, or before a near camera, each pixel has light directions of its own.
+    # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
         png = _observation_maps(whole, capture, network, errors_deg[network.name], pixels, title=title)
@@ -227,12 +227,12 @@ def capture_figures(
 
 
 def has_observation_maps(method: str) -> bool:
-    """Return whether a method has observation maps that figures can show."""
+    """Return whether a method uses observation maps, so that figures can show them."""
     return method in METHODS and METHODS[method].observation_maps
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
-    """Return a different stem of a file name for each capture, also where names have slashes."""
+    """Return a unique file name stem for each capture, even if the names contain slashes."""
     stems: list[str] = []
     taken: set[str] = set()
     for name in names:
@@ -251,7 +251,7 @@ def _observation_maps(
     *,
     title: str,
 ) -> bytes:
-    """Return the figure of some pixels. Raises UsageError for one without ground truth."""
+    """Return the figure for the given pixels. Raises UsageError for a pixel without ground truth."""
     for row, column in pixels:
         inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
         if not inside or np.isnan(errors_deg[row, column]):

@@ -1,4 +1,4 @@
-"""How an evaluation is done: draws of lights, trials, noise and pixels, and how captures are read; and its outcome."""
+"""The protocol of an evaluation (draws of lights, trials, noise, pixels, how captures are read) and its outcome."""
 
 import math
 import re
@@ -17,26 +17,26 @@ from splinecli.maths import Doubles
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
 DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
-"""First numbers of the seeds, so that draws, light noise and the choice of pixels are independent."""
+"""First elements of the seeds, so that draws, light noise and the choice of pixels are independent."""
 
 _REDRAWS = 1000
 _INDEX = re.compile(r"[0-9]{1,9}")
 
 
 def draw_lights(light_directions: Doubles, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
-    """Return random draws of lights without replacement, each in rising order.
+    """Return random draws of lights without replacement, each in ascending order.
 
-    Trial t depends only on the seed, the number of lights, `n_lights` and t. So captures with equally many lights get
-    the same draws, and more trials continue the same list. A draw is repeated only if its lights lie in one plane,
-    because no method can solve it. All lights together are one draw, whatever the number of trials.
+    Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the same number of lights
+    get the same draws, and additional trials extend the same list. A draw is repeated only if its lights are coplanar,
+    because no method can solve it. All lights together form one draw, regardless of the number of trials.
 
     Args:
         light_directions: (F, 3) unit.
-        n_lights: the number of lights in a draw; None for all of them.
+        n_lights: the number of lights in a draw; None for all lights.
 
     Raises:
-        UsageError: fewer than three lights, more than there are, no trials, or a negative seed.
-        InputError: every draw had its lights in one plane.
+        UsageError: fewer than three lights, more than available, no trials, or a negative seed.
+        InputError: in every draw, the lights were coplanar.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
@@ -49,7 +49,7 @@ def draw_lights(light_directions: Doubles, n_lights: int | None, *, trials: int 
 
 
 def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
-    """Raise UsageError for settings that fit no capture."""
+    """Raise UsageError for settings that are invalid for any capture."""
     if n_lights is not None and n_lights < MIN_LIGHTS:
         raise UsageError(f"--n-lights is {n_lights}; expected at least {MIN_LIGHTS}")
     if trials < 1:
@@ -60,7 +60,7 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 
 @dataclass(frozen=True)
 class DrawsFile:
-    """The draws of a file, all with the same number of lights."""
+    """The draws in a file, all with the same number of lights."""
 
     path: Path
     draws: tuple[Draw, ...]
@@ -71,9 +71,9 @@ class DrawsFile:
         return len(self.draws[0])
 
     def check_against(self, light_directions: Doubles, *, skipped: int = 0) -> None:
-        """Raise InputError, with the line, for a draw that does not fit a capture under these lights (F, 3).
+        """Raise InputError, with the line number, for a draw that does not fit a capture under these lights (F, 3).
 
-        No draw may name the first `skipped` lights.
+        Draws must not include the first `skipped` lights.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
@@ -90,10 +90,11 @@ class DrawsFile:
 
 
 def read_draws(path: Path) -> DrawsFile:
-    """Return the draws of a text file. Each line is one draw: light indices from 0, separated by spaces or commas.
+    """Return the draws in a text file. Each line is one draw: zero-based light indices separated by spaces or commas.
 
-    "#" comments and blank lines are skipped. Raises InputError with the line for a word that is no light index, a
-    repeated index, fewer than three lights, or another number than in the first draw; also for a file without draws.
+    "#" comments and blank lines are skipped. Raises InputError, with the line number, for a word that is not a light
+    index, a repeated index, fewer than three lights, or a number of lights that differs from the first draw; also for a
+    file without draws.
     """
     draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
@@ -109,7 +110,8 @@ def read_draws(path: Path) -> DrawsFile:
 def _draw(light_directions: Doubles, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(_REDRAWS):
-        # Uniform numbers, not Generator.choice: NumPy is more likely to keep this stream in later versions.
+        # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the same in later NumPy
+        # versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
@@ -133,7 +135,7 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     return draw
 
 
-EVERY_CAPTURE = "*"  # key of `skip_first` for all captures that have no key of their own
+EVERY_CAPTURE = "*"  # key in `skip_first` for all captures without their own key
 LARGEST_SIGMA_DEG = 30.0  # largest standard deviation of the light noise that an evaluation accepts
 
 
@@ -144,24 +146,24 @@ class Protocol:
     Raises UsageError if a value is out of its range.
     """
 
-    # in each draw. None means all lights of a capture. A draws file replaces it, and trials.
+    # in each draw. None means all lights of a capture. A draws file overrides this field and trials.
     n_lights: int | None = None
-    trials: int = 1  # the number of random draws. Without light noise, all lights need one trial only.
-    seed: int = 0  # of the draws, of the light noise and of the choice of pixels
-    draws_file: Path | None = None  # file that gives the draws instead; see read_draws
+    trials: int = 1  # the number of random draws. Without light noise, a draw of all lights needs only one trial.
+    seed: int = 0  # for the draws, the light noise and the choice of pixels
+    draws_file: Path | None = None  # file that provides the draws instead; see read_draws
     light_noise_deg: float = 0.0  # standard deviation of the angle by which each trial tilts the light directions
-    # number of pixels to score in each capture, chosen at random. None scores all pixels that have ground truth.
+    # number of randomly chosen pixels to score in each capture. None scores all pixels that have ground truth.
     max_pixels: int | None = None
-    # number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others
+    # number of images to skip at the start, by the name of the capture; EVERY_CAPTURE for all others
     skip_first: Mapping[str, int] = field(default_factory=dict)
-    # score the stored values alone, as the published tables do. By default, saturated observations are restored and
-    # unknown light intensities are estimated, as `infer` does.
+    # score the stored values only, as the published tables do. By default, saturated observations are restored and
+    # unknown light intensities are estimated, as in `infer`.
     as_stored: bool = False
     white_level: float | None = None
-    # usual error of light directions, with which each trial refines its directions (see refine_capture). None refines
-    # none.
+    # typical error of the light directions, with which each trial refines them (see refine_capture). None disables the
+    # refinement.
     light_error_deg: float | None = None
-    finds_lights: bool = False  # whether each trial finds its lights from its images, as `infer --lights estimate` does
+    finds_lights: bool = False  # whether trials estimate their lights from the images, as `infer --lights estimate`
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -169,7 +171,7 @@ class Protocol:
             raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
 
     def skipped_lights(self, capture: str) -> int:
-        """Return how many first lights of a capture are left out."""
+        """Return the number of lights that are skipped at the start of a capture."""
         return self.skip_first.get(capture, self.skip_first.get(EVERY_CAPTURE, 0))
 
 
@@ -179,12 +181,12 @@ def lights_value(protocol: Protocol) -> int | Literal["all"]:
 
 
 def lights_in_words(protocol: Protocol) -> str:
-    """Return the lights of a draw as text: "10 lights", "all lights"."""
+    """Return the number of lights in a draw as text: "10 lights", "all lights"."""
     return f"{lights_value(protocol)} lights"
 
 
 def heading(protocol: Protocol) -> str:
-    """Return what differs between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
+    """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
     noise = f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
     return lights_in_words(protocol) + noise
 
@@ -196,7 +198,7 @@ def protocol_in_words(protocol: Protocol) -> str:
         parts.append(f"the {protocol.trials} draws of {protocol.draws_file.name}")
     elif protocol.n_lights is not None:
         parts.append(f"{protocol.trials} random {'draw' if protocol.trials == 1 else 'draws'}")
-    elif protocol.light_noise_deg:  # without noise, all lights are one trial, whatever number was given
+    elif protocol.light_noise_deg:  # without noise, all lights need one trial, regardless of the number given
         parts.append(f"{protocol.trials} {'trial' if protocol.trials == 1 else 'trials'}")
     parts.append(f"seed {protocol.seed}")
     if protocol.max_pixels is not None:
@@ -219,8 +221,8 @@ class Result:
     capture: str  # name of the capture in the tables
     n_lights: int  # number of lights in each draw
     maes_deg: tuple[float, ...]  # mean angular error (MAE) over the scored pixels, in degrees, of each trial
-    seconds: float  # mean time to estimate the normals of a trial
-    # mean error of the light directions that the trials estimated; None where they did not
+    seconds: float  # mean time to estimate the normals in a trial
+    # mean error of the light directions estimated by the trials; None if they were not estimated
     found_light_error_deg: float | None = None
 
     @property
@@ -251,8 +253,8 @@ class Skipped:
 class Evaluation:
     """The outcome of one protocol."""
 
-    protocol: Protocol  # the protocol; n_lights and trials are those of the draws file where there is one
-    results: tuple[Result, ...]  # one for each capture and method, captures in the order given, then methods
+    protocol: Protocol  # the protocol; n_lights and trials are taken from the draws file, if given
+    results: tuple[Result, ...]  # one per capture and method, ordered by capture as given, then by method
     skipped: tuple[Skipped, ...] = ()  # the captures that could not be scored
     notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
     # {"weights", "device", "precision", "fingerprint"} of each method by name; see Estimator
@@ -260,12 +262,12 @@ class Evaluation:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods, each once."""
+        """Names of the methods, without duplicates."""
         return tuple(dict.fromkeys(result.method for result in self.results))
 
     @property
     def captures(self) -> tuple[str, ...]:
-        """Names of the scored captures, each once."""
+        """Names of the scored captures, without duplicates."""
         return tuple(dict.fromkeys(result.capture for result in self.results))
 
     @property
@@ -278,10 +280,10 @@ class Evaluation:
 
 
 def all_captures(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Return the names of the captures that any of the evaluations scored, each once."""
+    """Return the names of the captures scored by any of the evaluations, without duplicates."""
     return list(dict.fromkeys(capture for e in evaluations for capture in e.captures))
 
 
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[Skipped]:
-    """Return the captures that any of the evaluations skipped; the same reason comes once."""
+    """Return the captures skipped by any of the evaluations; repeated reasons are listed once."""
     return list(dict.fromkeys(skipped for e in evaluations for skipped in e.skipped))

@@ -1,4 +1,4 @@
-"""The trials of an evaluation, planned before any image is read, and scored side by side."""
+"""Plan the trials of an evaluation before any image is read, and score them in parallel."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ProtocolTrials:
     def evaluation(
         self, captures: Sequence[str], store: TrialStore, settings: Mapping[str, Mapping[str, Any]]
     ) -> Evaluation:
-        """Return the outcome, in the order of the captures. Raises an error where all captures failed."""
+        """Return the outcome, in the order of the captures. Raises an error if all captures failed."""
         results, n_estimated = [], {}
         for (capture, method), trials in self.trials.items():
             scores = [score for trial in trials if (score := store.find(trial)) is not None]
@@ -82,7 +82,7 @@ class ProtocolTrials:
 
 @dataclass
 class CaptureJob:
-    """A capture, opened, with the protocols that can score it, and the missing trials of each draw."""
+    """An open capture with the protocols that can score it and, for each draw, the missing trials."""
 
     source: CaptureSource
     reading: CaptureReading
@@ -103,9 +103,9 @@ class CaptureJob:
 def plan_capture(
     folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[ProtocolTrials], store: TrialStore
 ) -> CaptureJob | None:
-    """Add the trials of a capture to the tasks, and return those that the store does not have as a job.
+    """Add the trials of a capture to the tasks, and return the trials that are not in the store as a job.
 
-    Where no protocol can score the capture, this is None; the tasks then have the reasons.
+    If no protocol can score the capture, the result is None, and the reasons are recorded in the tasks.
     """
     try:
         source = open_to_score(folder, tasks[0].protocol)
@@ -115,7 +115,7 @@ def plan_capture(
         return None
     made_of = [digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators]
     able: list[ProtocolTrials] = []
-    # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
+    # Group all methods of a draw, because they share its capture, and because the remaining time can then be estimated.
     draws: list[list[Trial]] = []
     for task in tasks:
         try:
@@ -133,7 +133,7 @@ def plan_capture(
     if not able:
         return None
     missing = [left for draw in draws if (left := [trial for trial in draw if store.find(trial) is None])]
-    needed = missing or draws[:1]  # the notes on the capture need its mask and its ground truth
+    needed = missing or draws[:1]  # the notes on the capture require its mask and its ground truth
     protocols = tuple(task.protocol for task in able)
     methods = {trial.method for draw in needed for trial in draw}
     whole = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
@@ -143,7 +143,7 @@ def plan_capture(
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol with the numbers of lights and trials of its draws file, and its draws. Raises InputError."""
+    """Return the protocol, with n_lights and trials taken from its draws file, and the draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
     draws_file = read_draws(protocol.draws_file)
@@ -153,8 +153,8 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
 def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
     """Return the draws of a capture, one for each trial.
 
-    Raises InputError if the capture has no ground truth, or a draw of the file does not fit it, or UsageError if it has
-    too few lights, or near lamps that are to be refined.
+    Raises InputError if the capture has no ground truth, or a draw in the file does not fit it, or UsageError if it has
+    too few lights, or if the protocol would refine near lamps.
     """
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(
@@ -182,15 +182,15 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
         source.light_directions[skipped:], protocol.n_lights, trials=protocol.trials, seed=protocol.seed
     )
     draws = [tuple(light + skipped for light in draw) for draw in draws]
-    # All lights are one draw, but their noise differs from trial to trial.
+    # All lights form one draw, but their noise differs from trial to trial.
     return draws * protocol.trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
 
 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
-    """Return the folders, each once, with the names of the captures.
+    """Return the folders, without duplicates, with the names of the captures.
 
-    Where two names are equal, all captures are named by the last parts of their paths. No capture gets the name of
-    the tables' average.
+    If two names are equal, all captures are named by the last parts of their paths. The name of the average in the
+    tables is never used for a capture.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
@@ -213,20 +213,20 @@ def _nothing_scored(failures: list[SplinecliError]) -> SplinecliError:
 
 
 class DrawTask(NamedTuple):
-    """One draw of a capture: what is read for all its draws, and the trials of this one; none for the notes alone."""
+    """One draw of a capture: its trials, and the data read for all draws. Without trials, only notes are returned."""
 
     reading: CaptureReading
     trials: Sequence[Trial]
 
 
 Scored = tuple[Sequence[Score], Notes] | SplinecliError
-"""The score of each trial of a draw and the notes on its capture, or why the capture cannot be scored."""
+"""The score of each trial of a draw and the notes on its capture, or the reason that the capture cannot be scored."""
 
 Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
-"""Scores draws in other processes, and yields each with its scores as it ends."""
+"""Scores draws in other processes, and yields each draw with its scores as it finishes."""
 
 OnProgress = Callable[[float, str], object]
-"""Called with the share of all trials that was just done, and a short text. A trial counts by its pixels."""
+"""Called with the fraction of all trials just completed, weighted by their pixels, and a short text."""
 
 
 def evaluate_all(
@@ -239,22 +239,22 @@ def evaluate_all(
     elsewhere: Elsewhere | None = None,
     on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
-    """Score every estimator on every capture under every protocol. There are some of each, with different names.
+    """Score every estimator on every capture under every protocol. None may be empty, and names must be unique.
 
-    A capture is called by its name (capture_name). Where two names are equal, the captures are called by the last
-    parts of their paths. A folder that is given twice counts once. A capture that cannot be read, or has no ground
-    truth or too few lights, is skipped, and the outcome says why.
+    Captures are named by capture_name or, if two names are equal, by the last parts of their paths. Duplicate folders
+    are ignored. A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome
+    contains the reason.
 
     Args:
-        store: where finished trials are stored; those that it has are not computed again.
-        jobs: number of trials at a time, each on its share of the cores.
-        elsewhere: scores the draws in other processes, in place of `jobs`.
+        store: where finished trials are stored; trials in the store are not computed again.
+        jobs: number of trials to run in parallel, each on its share of the cores.
+        elsewhere: scores the draws in other processes, instead of using `jobs`.
         on_progress: see OnProgress. It is called by one thread at a time.
 
     Raises:
         UsageError: skip_first names a capture that does not exist.
-        InputError: the draws file is wrong, or no capture could be scored. The error of a single capture is raised
-            as it is, also a UsageError.
+        InputError: the draws file is invalid, or no capture could be scored. With a single capture, its own error is
+            raised, which may also be a UsageError.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
@@ -290,7 +290,7 @@ def _score_here(
     workers: ThreadPoolExecutor,
     jobs: int,
 ) -> None:
-    """Score `jobs` trials at a time in threads. Raises what a trial raises."""
+    """Score `jobs` trials at a time in threads. Errors from trials are passed on."""
 
     def score(shared: SharedDraw, trial: Trial) -> None:
         store.add(trial, shared.score(trial, estimators[trial.method], progress.begin))
@@ -309,7 +309,7 @@ def _score_here(
             shared = SharedDraw(source)
             for trial in draw:
                 running.add(workers.submit(score, shared, trial))
-                running = _wait(running, jobs)  # one trial waits, so that no core does
+                running = _wait(running, jobs)  # one trial waits, so that no core is idle
             del shared
         del source  # before the next capture is read
     _wait(running, 0)
@@ -318,7 +318,7 @@ def _score_here(
 def _score_elsewhere(
     captures: Sequence[CaptureJob], elsewhere: Elsewhere, store: TrialStore, progress: _Progress
 ) -> None:
-    """Let other processes score the trials. Raises what a trial raises."""
+    """Score the trials in other processes. Errors from trials are passed on."""
     jobs = {job.reading.name: job for job in captures}
     for task, scored in elsewhere([DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]):
         job = jobs[task.reading.name]
@@ -333,7 +333,7 @@ def _score_elsewhere(
 
 
 class _Progress:
-    """Counts trials over all threads."""
+    """Counts trials across all threads."""
 
     def __init__(self, total: int, advance: OnProgress) -> None:
         self._total, self._advance = total, advance
@@ -350,7 +350,7 @@ class _Progress:
             self._advance(count / max(1, self._total), "")
 
     def begin(self, n_pixels: int) -> Callable[[int], None]:
-        """Begin a trial. Returns the function that counts its pixels."""
+        """Start a trial and return the function that counts its pixels."""
         done = 0
 
         def count(pixels: int) -> None:
@@ -365,7 +365,7 @@ class _Progress:
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
-    """Wait until at most so many trials run, and return them. Raises what a finished one raised."""
+    """Wait until at most this many trials are running, and return them. Errors from finished trials are passed on."""
     while len(running) > at_most:
         finished, running = wait(running, return_when=FIRST_COMPLETED)
         for future in finished:
@@ -375,7 +375,7 @@ def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
 
 @contextmanager
 def _share_cores(jobs: int) -> Iterator[None]:
-    """Let PyTorch compute each of `jobs` trials at a time on a share of the cores. Does not import PyTorch."""
+    """Limit PyTorch to a share of the cores for each of `jobs` parallel trials. This does not import PyTorch."""
     torch = sys.modules.get("torch")
     if torch is None or jobs == 1:
         yield

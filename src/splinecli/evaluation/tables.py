@@ -1,12 +1,12 @@
 """Tests of whether methods differ by more than the draws of lights explain, and tables for people.
 
-All methods see the same draws, and a draw that is hard for one method is usually hard for the others. The test
+All methods are given the same draws, and a draw that is hard for one method is usually hard for the others. The test
 therefore uses the differences trial by trial: a paired t-test (Student, Biometrika 1908), corrected for the number of
-pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers the spread over draws
-only. A significant difference applies to other lights on this capture, not to other captures.
+pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers only the variation
+between draws. A significant difference generalises to other lights on this capture, not to other captures.
 
-Evaluations as tables for people: Markdown, LaTeX, and rows for a terminal. All functions take one evaluation, or
-several of the same methods that differ in n_lights, light_noise_deg or both.
+The tables are Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or several with the same
+methods that differ in n_lights, light_noise_deg or both.
 """
 
 import re
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from splinecli.errors import printable
 from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
 
-AVERAGE = "average"  # name that stands for the average over all captures, in place of a capture's name
+AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ
 
-# Error maps are float32: MAEs closer than this are equal.
+# Error maps are float32, so MAEs closer than this are considered equal.
 _SAME_DEG = 1e-6
 
 
@@ -31,16 +31,16 @@ _SAME_DEG = 1e-6
 class Comparison:
     """The difference of two methods on one capture, or on the average over the captures, trial by trial.
 
-    There is no test with one trial, or where the differences of all trials are equal but not zero: this is one trial
-    several times. interval_deg, p_value and p_holm are then None. Where all differences are zero, the interval is
-    (0, 0) and p is 1. Differences count as equal within 1e-6 degrees, the precision of the error maps.
+    With one trial, or if the differences of all trials are equal but not zero (the same trial repeated), no test is
+    possible, and interval_deg, p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p
+    is 1. Differences within 1e-6 degrees, the precision of the error maps, are considered equal.
     """
 
     capture: str  # name of the capture, or AVERAGE
     first: str
     second: str
     trials: int
-    # mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0
+    # mean over the trials of MAE(`first`) - MAE(`second`); `first` is better below 0
     difference_deg: float
     std_deg: float  # population standard deviation of the differences
     # 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0 while p_holm is
@@ -58,7 +58,7 @@ class Comparison:
 def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
     """Return the comparison of every pair of methods on every capture, then on the average over the captures.
 
-    Trial t of the average is the mean of trial t over the captures; see trial_averages.
+    Trial t of the average is the mean of trial t over the captures. See trial_averages.
     """
     comparisons: list[Comparison] = []
     for capture in evaluation.captures:
@@ -70,8 +70,8 @@ def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     """Return the MAE of a method in degrees for each trial, averaged over the captures.
 
-    A capture with one trial only, for example because it has K lights in all, repeats it. Where the numbers of trials
-    differ otherwise, only the trials that every capture has are averaged.
+    If a capture has only one trial, for example because it has just K lights, that trial is repeated. If the numbers of
+    trials differ otherwise, only the trials common to all captures are averaged.
     """
     maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
     most = max(map(len, maes_deg))
@@ -80,7 +80,7 @@ def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
 
 
 def in_words(comparison: Comparison) -> str:
-    """Return a comparison as a sentence."""
+    """Return a sentence that describes a comparison."""
     c = comparison
     better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
     size = f"{abs(c.difference_deg):.2f} degrees"
@@ -138,14 +138,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in corrected]
 
 
-_MOST_WIDE = 6  # captures: with more, the table is set in small type, so that DiLiGenT's ten fit on a page
+_MOST_WIDE = 6  # captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
 _LATEX = str.maketrans(
     {
         **{character: f"\\{character}" for character in "&%$#_{}"},
         "\\": r"\textbackslash{}",
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
-        # In TeX's oldest font encoding, still the default, these are other characters.
+        # In TeX's oldest font encoding, which is still the default, these codes are other characters.
         "<": r"\textless{}",
         ">": r"\textgreater{}",
         "|": r"\textbar{}",
@@ -154,7 +154,7 @@ _LATEX = str.maketrans(
 
 
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return a header row, then a row for each method: name, MAE on each capture, average; two decimals."""
+    """Return a header row, then a row for each method: name, MAE on each capture, average; with two decimals."""
     mae_deg = {(result.method, result.capture): result.mae_deg for result in evaluation.results}
     rows = [["method", *(printable(name) for name in evaluation.captures), AVERAGE]]
     for method, average in evaluation.averages.items():
@@ -164,7 +164,7 @@ def table_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
-    """Return the (row, column) of the smallest printed values of each column; none where there is one method."""
+    """Return the (row, column) of the smallest printed values in each column; empty for a single method."""
     best = set()
     if len(rows) > 2:
         for column in range(1, len(rows[0])):
@@ -174,14 +174,14 @@ def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
 
 
 def caption(evaluation: Evaluation) -> str:
-    """Return what a table shows, with the protocol: "Mean angular error in degrees: 10 lights, ..."."""
+    """Return a table's caption, with the protocol: "Mean angular error in degrees: 10 lights, ..."."""
     return f"Mean angular error in degrees: {protocol_in_words(evaluation.protocol)}."
 
 
 def markdown(evaluations: Sequence[Evaluation]) -> str:
     """Return a Markdown table of methods by captures and their average, with a caption below it.
 
-    The best value of each column is bold. With several evaluations, each has its table under a heading.
+    The best value in each column is bold. With several evaluations, each has its own table under a heading.
     """
     tables = []
     for evaluation in evaluations:
@@ -196,14 +196,14 @@ def markdown(evaluations: Sequence[Evaluation]) -> str:
 def latex(evaluations: Sequence[Evaluation]) -> str:
     """Return a floating table for each evaluation, for a document that loads booktabs.
 
-    table* spans both columns of a paper that has two.
+    table* spans both columns of a two-column paper.
     """
     needs = "% Needs \\usepackage{booktabs} in the preamble.\n"
     return needs + "\n".join(_latex_table(evaluation) for evaluation in evaluations)
 
 
 def _escape_markdown(text: str) -> str:
-    """Return text of one line that Markdown shows as it is."""
+    """Return the text on one line, escaped so that Markdown shows it unchanged."""
     return re.sub(r"([\\`*<>|\[\]&~])", r"\\\1", " ".join(text.split()))
 
 
@@ -229,7 +229,7 @@ def _latex_table(evaluation: Evaluation) -> str:
 
 
 def _marked_rows(evaluation: Evaluation, escape: Callable[[str], str], bold: str) -> list[list[str]]:
-    """Return table_rows with the best cells in a template for bold text."""
+    """Return table_rows with the best cells formatted by a template for bold text."""
     rows = table_rows(evaluation)
     best = best_cells(rows)
     return [

@@ -1,4 +1,4 @@
-"""Trials, their scores, which are stored as they come, and what a trial sees of a capture."""
+"""Trials, the store of their scores, which are saved as they are computed, and the capture data for each trial."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ from splinecli.system.publishing import is_plain
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one capture under one draw of lights, with everything that decides its score."""
+    """One method on one capture under one draw of lights, with everything that affects its score."""
 
     capture: str  # name of the capture in the tables
     method: str
@@ -62,9 +62,9 @@ class Trial:
 
     @property
     def key(self) -> str:
-        """SHA-256 of what decides the score. The noise depends on seed and number, the pixels on the seed."""
+        """SHA-256 of all that affects the score. The noise depends on seed and number, the pixels on the seed."""
         values = self.record
-        del values["capture"]  # only a name in the tables: made_of has the files themselves
+        del values["capture"]  # only a name in the tables; made_of covers the files themselves
         if self.protocol.light_error_deg is None:
             del values["light_error_deg"]  # so that earlier trials stay valid
         if not self.protocol.finds_lights:
@@ -83,15 +83,15 @@ class Score:
     mae_deg: float  # mean angular error over the scored pixels
     seconds: float  # time spent on estimating their normals
     estimated_intensities: bool  # whether the light intensities were estimated from the images
-    # mean error of light directions that were estimated from the images; None where none were
+    # mean error of the light directions estimated from the images; None if they were not estimated
     found_light_error_deg: float | None = None
 
 
 class TrialStore:
-    """Scores by trial, in memory and, where a path is given, in a file of JSON lines, which the first score creates.
+    """Scores by trial, in memory and, if a path is given, in a JSON Lines file, which is created for the first score.
 
-    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed. `fresh`
-    deletes the scores of an earlier evaluation. Raises OutputError if the file cannot be read or written.
+    Lines that cannot be read, for example because they were truncated, are dropped. A link is replaced, not followed.
+    `fresh` deletes the scores of an earlier evaluation. Raises OutputError if the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:
@@ -104,16 +104,16 @@ class TrialStore:
             kept = []
             if is_plain(path) and not fresh:
                 with path.open(encoding="utf-8", errors="replace") as file:
-                    while line := file.readline(1 << 16):  # a longer one in parts
+                    while line := file.readline(1 << 16):  # longer lines are read in parts
                         if (read := _read_line(line)) is not None:
                             kept.append(line.rstrip("\n") + "\n")
                             self._scores.update((read,))
-            # Anew, because the next lines would reach every other name of this file.
+            # Write a new file, because appending would also change any hard link to the old one.
             if os.path.lexists(path):
                 write_text(path, "".join(kept))
 
     def find(self, trial: Trial) -> Score | None:
-        """Return the score of a trial, or None where it is not stored."""
+        """Return the score of a trial, or None if it is not stored."""
         return self._scores.get(trial.key)
 
     def add(self, trial: Trial, score: Score) -> None:
@@ -150,19 +150,20 @@ DAMAGED_IMAGES = {"bearPNG": 20}
 class TrialSource:
     """A capture that was read once, from which each trial takes its lights.
 
-    Every draw is restored by itself: a saturated observation is restored from the other lights of the draw, as
-    `infer` restores it when it reads only these lights.
+    Every draw is restored separately: a saturated observation is restored from the other lights of the draw, as
+    `infer` does when it reads only these lights.
 
-    `rows` are the rows of the observations to score; None for all of them.
+    `rows` are the rows of the observations to score; None for all rows.
     """
 
     stored: StoredCapture
     rows: NDArray[np.integer] | None = None
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
-        """Return the capture under the lights of a trial, which have noise, or are refined or found, if it says so.
+        """Return the capture under the lights of a trial, with noise added, refined or estimated as the trial requires.
 
-        It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
+        It contains the scored pixels or, with `whole`, all pixels. As in `infer`, lights are refined or estimated from
+        all pixels.
         """
         protocol, pixels = trial.protocol, None if whole else self.rows
         seen = self.stored.choose_lights(self.places(trial.lights))
@@ -170,7 +171,7 @@ class TrialSource:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
         if protocol.finds_lights:
             seen = seen.find_lights(partial(find_lights, refuse=False))
-        # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
+        # The intensities are estimated from all pixels, so this happens before the scored pixels are chosen.
         intensities = None if protocol.as_stored else seen.estimate_intensities()
         needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
         if pixels is not None and not needs_all:
@@ -181,17 +182,17 @@ class TrialSource:
             capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
         if pixels is None:
             return capture
-        # Near lamps need the surface, which only all pixels together have.
+        # Near lamps require the surface, which can only be computed from all pixels together.
         return find_surface(capture).choose_pixels(pixels)
 
     def places(self, lights: Sequence[int]) -> list[int]:
-        """Return the places of lights among those that were read."""
+        """Return the positions of lights among the lights that were read."""
         place = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
         return [place[light] for light in lights]
 
 
 class SharedDraw:
-    """The capture that the methods of one draw share. The first method that needs it makes it."""
+    """The capture shared by the methods of one draw. It is computed by the first method that needs it."""
 
     def __init__(self, source: TrialSource) -> None:
         self._source = source
@@ -201,8 +202,8 @@ class SharedDraw:
     def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
         """Return the score of a trial of the draw. Any thread may call this.
 
-        `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
-        SplinecliError if the method returns normals that are not unit vectors.
+        `begin` is called with the number of pixels before they are estimated and returns a function that counts
+        finished pixels. Raises SplinecliError if the method returns normals that are not unit vectors.
         """
         source, whole = self._source, estimator.refiner is not None
         with self._lock:
@@ -210,7 +211,7 @@ class SharedDraw:
                 self._captures[whole] = source.see(trial, whole=whole)
         capture = self._captures[whole]
         estimate = estimate_normals(capture, estimator, progress=None if begin is None else begin(capture.n_pixels))
-        assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
+        assert estimate.errors is not None and estimate.error_map_deg is not None  # otherwise there would be no trials
         mae_deg = estimate.errors.mean
         if source.rows is not None and capture.n_pixels != len(source.rows):
             mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
@@ -224,7 +225,7 @@ class SharedDraw:
 def _with_noise(capture: Capture, trial: Trial) -> Capture:
     """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
     generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
-    # Few lights and much noise can give lights in one plane. Such noise is drawn again.
+    # With few lights and large noise, the lights can become coplanar. Such noise is drawn again.
     for _ in range(100):
         directions = tilt_lights(capture.light_directions, trial.protocol.light_noise_deg, generator)
         if not in_one_plane(directions):
@@ -236,10 +237,10 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
 def tilt_lights(
     light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
+    """Return unit light directions (F, 3), each rotated by an angle from N(0, sigma_deg) in a random direction.
 
-    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is turned the
-    opposite way and stays above it, so that a capture may have any of the directions.
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is rotated the
+    opposite way and stays above it, so that all directions are valid for a capture.
     """
     n_lights = len(light_directions)
     angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
@@ -254,16 +255,16 @@ def tilt_lights(
 
 @dataclass(frozen=True)
 class CaptureReading:
-    """What the trials of a capture need of it."""
+    """The parts of a capture that its trials need."""
 
-    folder: Path  # the capture's folder as it was given. Other processes open it again.
+    folder: Path  # the capture's folder as given; other processes open it again
     name: str
-    protocols: tuple[Protocol, ...]  # those that can score it. All protocols of an evaluation score the same pixels.
-    lights: tuple[int, ...]  # those of all trials, in rising order
-    whole: bool  # whether all pixels are needed: a method sees neighbours, or lights are refined or found
+    protocols: tuple[Protocol, ...]  # the protocols that can score it; they all score the same pixels
+    lights: tuple[int, ...]  # the lights used by any trial, in ascending order
+    whole: bool  # whether all pixels are needed: a method uses neighbours, or lights are refined or estimated
 
     def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
-        """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
+        """Return the capture under all lights, and the notes on it, by protocol. Raises InputError, UsageError."""
         numbers, as_stored = count(1), all(protocol.as_stored for protocol in self.protocols)
         try:
             stored = source.read_stored(
@@ -276,7 +277,7 @@ class CaptureReading:
         if len(pixels) == stored.capture.n_pixels:
             trials = TrialSource(stored)
         elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
-            # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
+            # `infer` estimates unknown intensities from all pixels, and near lamps require the whole surface.
             trials = TrialSource(stored, pixels)
         else:
             trials = TrialSource(stored.choose_pixels(pixels))
@@ -293,7 +294,7 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
 
 
 def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
-    """Return sentences about what is special about a capture and how the evaluation treated it."""
+    """Return sentences about the peculiarities of a capture and how the evaluation treated them."""
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
     if skipped:
@@ -320,8 +321,8 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
 def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
     """Return the rows of the observations that have ground truth, in rising order.
 
-    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
-    that sees neighbours estimates all pixels, and only these are scored. Raises InputError without ground truth.
+    With `max_pixels`, at most that many are chosen by the seed, the same for every method and trial. A method that uses
+    neighbours estimates all pixels, but only these are scored. Raises InputError without ground truth.
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")

@@ -1,1 +1,1 @@
-"""What a command does with one capture or many, without a terminal."""
+"""The work of each command on one or more captures, independent of the terminal."""

@@ -1,7 +1,6 @@
-"""Run `infer` on many captures, in this process or on others, and go on past a capture that fails.
+"""Run `infer` on many captures, in this process or in others, and continue if a capture fails.
 
-The captures of a batch of `infer`. A folder that is given twice counts once. A capture whose results are up to date is
-skipped. The error of one that fails is kept.
+Duplicate folders are ignored. Captures with up-to-date results are skipped. If a capture fails, its error is recorded.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from splinecli.system.publishing import held_folder, is_plain
 
 @dataclass(frozen=True)
 class Member:
-    """A capture of a batch. `missing` says why it cannot be read, if there is no such folder."""
+    """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not exist."""
 
     folder: Path
     name: str
@@ -51,9 +50,9 @@ class Member:
 
 
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
-    """Return the captures in the order given. A folder that is given twice counts once.
+    """Return the captures in the order given, without duplicate folders.
 
-    Raises UsageError if images are given in place of their folder, two captures have the same name, or a "folder" that
+    Raises UsageError if images are given instead of their folder, two captures have the same name, or a "folder" that
     does not exist is the name of a map, format or method.
     """
     if folders and all(path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path) for path in folders):  # noqa: PTH113
@@ -62,10 +61,10 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)
     if shard is not None:
-        # In the order of their bytes: a shell sorts captures/* by its language, and the machines of a cluster may
-        # differ in that.
+        # Sort by bytes, because the shell's order of captures/* depends on the locale, which may differ between the
+        # machines of a cluster.
         chosen = set(sorted(folders, key=os.fsencode)[shard.number - 1 :: shard.n_parts])
-    # Also of the other shards, because their results go to the same place.
+    # Include the captures of the other shards, because their results go to the same place.
     members = {folder: _member(folder) for folder in folders}
     seen: dict[str, Path] = {}
     for folder, member in members.items():
@@ -78,16 +77,16 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
 
 
 def _own_path(folder: Path) -> Path:
-    """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
+    """Return the same path for all spellings of a folder. A link keeps its name, because its results use that name."""
     try:
         return resolve(folder) if ".." in folder.parts else folder.absolute()
     except InputError:
-        return folder  # what is wrong with it is reported when its turn comes
+        return folder  # the error is reported when this capture is processed
 
 
 def _member(folder: Path) -> Member:
-    """Return the capture in the folder. Raises UsageError for a word of another option."""
-    # What is wrong with a folder that cannot be read is reported when its turn comes.
+    """Return the capture in the folder. Raises UsageError for a value that belongs to another option."""
+    # If a folder cannot be read, the error is reported when that capture is processed.
     try:
         exists = find_mode(folder) is not None
     except InputError:
@@ -112,8 +111,8 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 class Outcome:
     """Outcome of one capture."""
 
-    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (there is no such
-    # folder) or failed
+    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (the folder does
+    # not exist) or failed
     status: Status
     report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
     exit_code: int = 0
@@ -123,10 +122,10 @@ class Outcome:
 def run_member(
     member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
 ) -> Outcome:
-    """Compute one capture of a batch, unless its results are up to date or are to be kept.
+    """Compute one capture of a batch, unless its results are up to date or must be kept.
 
-    `method` returns the estimator; it is called if the capture is computed. Raises UsageError or ModelError as it does:
-    they are wrong for every capture. Raises NoRoomError if the disk is full or read-only.
+    `method` returns the estimator; it is called only if the capture is computed. Its UsageError or ModelError is passed
+    on, because it would affect every capture. Raises NoRoomError if the disk is full or read-only.
     """
     if member.missing is not None:
         return failed(member.name, member.missing, status="missing")
@@ -151,7 +150,7 @@ def run_member(
 
 
 def _failure(member: Member, error: Exception) -> Outcome:
-    """Return what became of a capture that failed. Raises NoRoomError, because other folders would fail, too."""
+    """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would fail, too."""
     trace = ""
     if is_out_of_memory(error):
         hint = "Close other programs, or use smaller images"
@@ -186,20 +185,20 @@ class ChangedError(OutputError):
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results are those of the capture in `folder` and the options.
+    """Return the report in `target` if its results match the capture in `folder` and the options.
 
-    Without results it is None. If an interrupted run left some, `warn` receives a sentence about that.
+    Returns None if no results exist. If an interrupted run left partial results, `warn` receives a sentence about this.
 
     Raises:
-        ChangedError: the results are not those of this capture and these options.
+        ChangedError: the results belong to another capture or other options.
         InputError: the capture cannot be read.
-        OutputError: both are one folder, which may have files of the user with the names of results.
+        OutputError: `target` is also the capture's folder, where the user's own files may have the names of results.
     """
     try:
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
         version, stamp = report["version"], report["inputs_sha256"]
-        if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
+        if Entry.of(report).row.capture != target.name:  # raises if the report is incomplete
             raise ValueError
     except UnfinishedError as error:
         found = next((name for name in own_files() if (target / name).exists()), None)
@@ -234,22 +233,23 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions = HERE,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield its outcome, in order, or on other processes as they end.
+    """Run `infer_capture` on each folder and yield the outcomes, in order, or as they finish in other processes.
 
-    With several captures, or where OUT/index.html is there already, that page is written at the end.
+    With several captures, or if OUT/index.html already exists, that page is written at the end.
 
     Args:
-        folders: the captures. A folder that is given twice counts once.
-        redo: which captures that have results are computed again.
-        cluster: the processes or machines that compute. A number of workers of 0 means as many as the machine's cores
-            and memory allow.
+        folders: the captures. Duplicates are ignored.
+        redo: which captures with existing results are computed again.
+        cluster: the processes or machines to run on. With 0 workers, as many are started as the machine's cores and
+            memory allow.
 
     Raises:
         UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
             exist is the name of a map, format or method.
         InputError: a file that the options name does not exist.
         ModelError: the weights cannot be used.
-        OutputError: the output folder cannot be written, or the disk is full. A single folder in it only fails.
+        OutputError: the output folder cannot be written, or the disk is full. If only the folder of one capture cannot
+            be written, that capture fails and the batch continues.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
     members = list_captures(folders, shard)
@@ -275,7 +275,7 @@ def infer_batch(
         yield outcome
     if with_index and members:
         with held_folder(output, observer.warn, wait=True):
-            # Of those that changed it shows the results that were kept.
+            # For changed captures, the page shows the results that were kept.
             shown = with_earlier([entries[number] for number in sorted(entries)], output)
             write_text(output / INDEX, index_page(shown, output))
 
@@ -283,8 +283,8 @@ def infer_batch(
 def _on_workers(
     members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
-    """Yield the number and the outcome of each capture as it ends on another process."""
-    # On any device: the machine of the command may have none of the workers' GPUs.
+    """Yield the number and the outcome of each capture as it finishes in another process."""
+    # Accept any device, because the workers may have GPUs that the command's machine does not have.
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
@@ -312,7 +312,7 @@ def _on_workers(
 
 
 class _Warnings(Observer):
-    """Keeps warnings, which go back with the report."""
+    """Collects warnings, which are returned with the report."""
 
     def __init__(self) -> None:
         self.found: list[str] = []
@@ -324,7 +324,7 @@ class _Warnings(Observer):
 def _infer(
     options: InferOptions, redo: Redo, sha256: str | None, number: int, member: Member
 ) -> tuple[Outcome, list[str]]:
-    """Compute a capture on a worker, and return what became of it and the warnings."""
+    """Compute a capture on a worker, and return its outcome and the warnings."""
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
@@ -336,7 +336,7 @@ def _infer(
 
 @lru_cache(maxsize=1)
 def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
-    """Return the estimator of this worker; loading it takes a second. Options are equal on any device, `method` not."""
+    """Return this worker's estimator, which takes a second to load. Unlike `method`, options ignore the device."""
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
@@ -349,24 +349,24 @@ def _method(options: InferOptions, method: MethodOptions, sha256: str | None) ->
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
-    """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
+    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest exit code."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
 
 def expected_bytes(member: Member, options: InferOptions) -> float:
-    """Return about how many bytes `infer` takes for a capture; see source_bytes."""
+    """Return the approximate memory in bytes that `infer` needs for a capture. See source_bytes."""
     n_lights = options.n_lights or len(options.light_indices or ())
     return source_bytes(lambda: options.open(member.folder), n_lights)
 
 
 def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
-    """Return how many captures this machine can compute side by side: by its cores, and by its memory.
+    """Return the number of captures that this machine can compute in parallel, given its cores and its memory.
 
-    A GPU computes one at a time.
+    A GPU computes one capture at a time.
     """
     if choose_device(options.device).type == "cuda":
         return 1
-    asked = members[:: max(1, len(members) // 16)]  # captures that stand for a batch
+    asked = members[:: max(1, len(members) // 16)]  # a sample that represents the batch
     each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
     return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

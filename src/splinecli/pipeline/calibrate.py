@@ -1,4 +1,4 @@
-"""What `calibrate` does: images of balls and of a gray target in, light files and a report out."""
+"""Calibrate lights: read images of balls and of a gray target, and write light files and a report."""
 
 import json
 from typing import Any
@@ -34,9 +34,9 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
 
 
 def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, Any]:
-    """Do the work of calibrate_lights in the folder of results, which the caller holds."""
+    """Run calibrate_lights in the folder of results, which the caller has locked."""
     target = options.gray_ball or options.gray_card
-    # A wrong path must not come to light after all images are read.
+    # Report a wrong path now, not only after all images have been read.
     target_files = None if target is None else find_ball_files(target)
     balls = [
         find_ball_files(folder, mask=mask)
@@ -69,7 +69,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
         texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
         if lamps.view.known:
             texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
-    # Files that are not written anew would belong to earlier lights. They are removed.
+    # Remove files that this run does not overwrite, because they belong to earlier lights.
     with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
         for name, text in texts.items():
             new.write(name, text)

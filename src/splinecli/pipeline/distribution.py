@@ -1,6 +1,6 @@
-"""Map a function over items on other processes: those of this machine, or the workers of a Dask cluster.
+"""Map a function over items in other processes, either on this machine or on the workers of a Dask cluster.
 
-Paths travel to the workers and reports back, arrays never do. Dask repeats an item whose worker was lost.
+Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its worker is lost.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 
 _CONNECT_SECONDS = 5.0
-_ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
+_ANSWER_SECONDS = 6.0  # time limit for a server to answer as a scheduler
 _CLOSE_SECONDS = 5.0
 _LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
 
-# A terminal sends Ctrl-C to the workers, too. The command ends them.
+# A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
 _IGNORE_INTERRUPTS = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 _QUIET = {
@@ -50,14 +50,14 @@ _QUIET = {
     "distributed.scheduler.work-stealing": False,
     "distributed.worker.profile.enabled": False,
 }
-"""Settings of Dask without what serves its dashboard only. It would take processor time, and memory for an hour."""
+"""Dask settings that disable the collection of dashboard data, which costs processor time and an hour of memory."""
 
 
 @contextmanager
 def connected(options: ClusterOptions) -> Iterator[Client]:
-    """Yield a Dask client: of a new cluster of this machine's processes, or of a running one.
+    """Yield a Dask client, connected to a new cluster of processes on this machine or to a running cluster.
 
-    Raises UsageError if Dask is not installed, or there is no scheduler at the address.
+    Raises UsageError if Dask is not installed, or no scheduler answers at the address.
     """
     distributed = import_extra("distributed", "cluster")
     if options.address is None:
@@ -80,8 +80,9 @@ def _client(address: str) -> Client:
         async with rpc(address, timeout=_CONNECT_SECONDS) as server:
             return await asyncio.wait_for(server.identity(), _ANSWER_SECONDS)
 
-    # A client waits for ever for a server that is no scheduler. One that fails to start can block Dask's event loop
-    # when Python deletes it. For this reason, the server says first what it is, in a thread: this one may have a loop.
+    # A client waits forever for a server that is not a scheduler, and a client that fails to start can block Dask's
+    # event loop when Python deletes it. We therefore identify the server first. This runs in a separate thread, because
+    # the current one may already have an event loop.
     try:
         with ThreadPoolExecutor(1) as thread:
             identity = thread.submit(asyncio.run, identify()).result()
@@ -97,7 +98,7 @@ def _client(address: str) -> Client:
 
 @contextmanager
 def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
-    """Yield a Dask cluster of processes of this machine, each with its share of the cores."""
+    """Yield a Dask cluster of processes on this machine, each with its share of the cores."""
     import dask
     from distributed import LocalCluster
 
@@ -109,11 +110,11 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         **_QUIET,
-        # An item whose worker was lost is tried again twice. A running cluster has a setting of its own.
+        # If a worker is lost, its item is retried twice. A running cluster has its own setting.
         "distributed.scheduler.allowed-failures": 2,
         "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
-        # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives it up.
+        # On a busy machine, a restarted worker may need more time than Dask allows by default.
         "distributed.deploy.lost-worker-timeout": "1 h",
     }
     with dask.config.set(settings):
@@ -121,13 +122,13 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             cluster = LocalCluster(
                 n_workers=options.workers,
                 threads_per_worker=1,
-                env=environment,  # also where the user's environment has other numbers
-                memory_limit=0,  # what is free on the machine is shared out by Distributor
+                env=environment,  # overrides the numbers in the user's environment
+                memory_limit=0,  # Distributor divides the machine's free memory
                 resources={"GPU": 1} if options.gpu else None,
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
-        except RuntimeError as error:  # Dask's, of which a cause may be what the system refused
+        except RuntimeError as error:  # raised by Dask; its cause may be an error of the operating system
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
@@ -143,7 +144,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
 
 
 def _address(text: str) -> str:
-    """Return the address of a scheduler, which may be in a scheduler file. Raises UsageError."""
+    """Return the address of a scheduler, reading the scheduler file if one is given. Raises UsageError."""
     from distributed.comm.registry import backends
 
     scheme, separator, _ = text.partition("://")
@@ -161,18 +162,18 @@ def _address(text: str) -> str:
 SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
 SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
-_LOOK_SECONDS = 0.5  # between two looks at which workers there are
+_LOOK_SECONDS = 0.5  # between two updates of the list of workers
 
-_ONE_AT_A_TIME = Lock()  # item of a worker: the working folder and PyTorch's threads belong to the process
+_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
 
 
 class LostError(SplinecliError):
-    """A worker was lost, or has too little memory: the item was not done, others may be."""
+    """A worker was lost, or has too little memory, so this item failed; other items may still succeed."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """The arguments of Work.do, a name for messages, and the bytes of memory that the item takes."""
+    """The arguments of Work.do, a name for messages, and the memory in bytes that the item needs."""
 
     args: tuple[Any, ...]
     name: str
@@ -185,17 +186,17 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Work:
-    """What all items of a command share. It travels with each item."""
+    """The settings shared by all items of a command; they are sent with each item."""
 
-    # called with the arguments of an item. It returns the result, or raises what is wrong with the worker.
+    # called with the arguments of an item; returns the result, or raises an error about the worker
     do: Callable[..., Any]
-    probe: str  # a file in the output folder. Workers that do not see it have another storage.
-    # the working folder of the command, which its relative paths start from
+    probe: str  # a file in the output folder; a worker that cannot find it uses different storage
+    # the working folder of the command, against which relative paths are resolved
     folder: str = field(default_factory=os.getcwd)
-    versions: dict[str, str] = field(default_factory=_versions)  # of the packages that must be the same
+    versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:
-        """Make this worker ready. Raises UsageError or InputError if it does not fit."""
+        """Prepare this worker. Raises UsageError or InputError if it is incompatible with the command."""
         for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
             if found != expected:
                 raise UsageError(f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS)
@@ -219,7 +220,7 @@ def this_worker() -> str:
 
 
 def _do(work: Work, *args: Any) -> Any:
-    """Do an item on a worker, and return its result. The message of an error names the worker."""
+    """Process an item on a worker and return its result. Error messages name the worker."""
     try:
         with _ONE_AT_A_TIME:
             work.enter()
@@ -231,7 +232,7 @@ def _do(work: Work, *args: Any) -> Any:
 
 @dataclass
 class Distributor:
-    """Gives items to the workers of a Dask cluster, at most one for each worker. Workers may come and go."""
+    """Assigns items to the workers of a Dask cluster, at most one at a time each. Workers may join and leave."""
 
     client: Client
     work: Work
@@ -241,13 +242,13 @@ class Distributor:
     _done: SimpleQueue[Future] = field(default_factory=SimpleQueue)
 
     def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Any]]:
-        """Yield each item with its result as it ends, or with a LostError.
+        """Yield each item with its result, or with a LostError, as it finishes.
 
         Raises:
-            SplinecliError: what an item raised, or what is wrong with a worker. The message names the worker.
+            SplinecliError: an item failed, or a worker is unusable. The message names the worker.
             SplinecliError: the scheduler was lost.
         """
-        # Where splinecli is not installed, a worker could not even read an item.
+        # A worker without splinecli could not even unpickle an item.
         for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
             if isinstance(found, metadata.PackageNotFoundError):
                 raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
@@ -260,7 +261,7 @@ class Distributor:
             workers = self._workers()
             if workers:
                 began = time.monotonic()
-            # A cluster of this machine counts as lost after a minute.
+            # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
                 raise SplinecliError(
                     "the workers end while they are getting ready",
@@ -269,7 +270,7 @@ class Distributor:
             while following is not None and len(self.running) < len(workers):
                 limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
                 largest = max(float(limit or math.inf) for limit in limits)
-                # The workers of a cluster have limits of Dask. Those of this machine share its memory.
+                # The workers of a cluster have Dask's memory limits, whereas local workers share this machine's memory.
                 used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
                 if following.memory > largest:
                     error = LostError(
@@ -288,7 +289,7 @@ class Distributor:
                 yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """Return what Dask says of the workers that may be used. Raises SplinecliError if the scheduler is lost."""
+        """Return Dask's information on the usable workers. Raises SplinecliError if the scheduler is lost."""
         try:
             found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, TimeoutError, RuntimeError) as error:
@@ -326,7 +327,7 @@ class Distributor:
         try:
             result = future.result(timeout=_LOOK_SECONDS)
         except TimeoutError:
-            if future.status == "error":  # of the item itself
+            if future.status == "error":  # the item itself failed
                 raise
             future.add_done_callback(self._done.put)  # the worker was lost with the result: Dask repeats it
             return
@@ -357,13 +358,13 @@ def distributor(
 ) -> Iterator[Distributor]:
     """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does, or OutputError.
 
-    By the output folder, which is made as needed, workers show that they have the same storage.
+    The output folder, which is created if needed, serves to check that the workers use the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:
         with refusals_as_output_errors(output):
             stack.enter_context(made_folder(output))
-            # Locked, so that no other batch takes it for the file of a killed process, and removes it.
+            # Lock the file, so that no other batch removes it as a leftover of a killed process.
             stack.enter_context(locked_file(probe, wait=True))
         client = stack.enter_context(connected(options))
         yield Distributor(client, Work(do, str(probe.absolute())), options, observer)

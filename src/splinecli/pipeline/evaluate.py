@@ -1,4 +1,4 @@
-"""What `evaluate` does: score methods on captures, and write tables, plots and a report."""
+"""Score methods on captures, and write tables, plots and a report."""
 
 from __future__ import annotations
 
@@ -81,10 +81,10 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
 
 
 def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
-    """Raise UsageError if more lights are requested than any capture has."""
+    """Raise UsageError if the number of lights exceeds the lights of every capture."""
     most = 0
     for capture in captures:
-        with suppress(InputError, OSError):  # the evaluation skips the capture and says why
+        with suppress(InputError, OSError):  # the evaluation skips the capture and reports the reason
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
@@ -119,11 +119,11 @@ def _score_on_workers(
     observer: Observer,
     draws: Sequence[DrawTask],
 ) -> Iterator[tuple[DrawTask, Scored]]:
-    """Yield the draws with their scores as they end: one item a draw. Only this process writes the store of trials.
+    """Yield the draws with their scores as they finish, one item per draw. Only this process writes to the store.
 
     Raises:
-        LostError: the workers of a draw were lost. All others are scored.
-        SplinecliError: what a trial or Distributor.run raises.
+        LostError: the workers of a draw were lost. All other draws are still scored.
+        SplinecliError: an error from a trial or from Distributor.run.
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
@@ -146,7 +146,7 @@ def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: Met
 
 @lru_cache(maxsize=1)
 def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
-    """Return the scorer of the command that this worker serves: files may change until the next command."""
+    """Return the scorer for the worker's current command; it is not reused, because files may change in between."""
     return _Scorer(fingerprints, options)
 
 

@@ -1,4 +1,4 @@
-"""Captures that come in: films, unpacked into folders of images, and folders, each when it is complete."""
+"""Detect incoming captures once they are complete: folders of images, and films, whose frames are extracted."""
 
 import json
 import os
@@ -23,15 +23,15 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
 def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo) -> Path:
-    """Return the capture; of a film, the folder of its frames in `output`, which are taken now or were earlier.
+    """Return the capture; for a film, the folder in `output` with its frames, which are extracted if needed.
 
     Args:
-        redo: whether frames of an earlier film are kept, replaced by those of another film, or taken again.
+        redo: whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
 
     Raises:
-        UsageError: the lights of a film are not to be found from its images.
+        UsageError: the options do not ask for the lights of a film to be estimated from its images.
         InputError: the film cannot be read, or its light does not move.
-        OutputError: the folder has frames of another film, or other files, or the frames cannot be written.
+        OutputError: the folder contains frames from another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
@@ -42,7 +42,7 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
     refuse_link(folder)
     with held_folder(folder, observer.warn):
         of_film, sizes = _earlier(folder)
-        # Other files would count as photographs, or as a mask.
+        # Other files would be mistaken for photographs, or for a mask.
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
@@ -73,7 +73,7 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
 
 
 def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
-    """Return the stamp of the film whose frames are in the folder, and their sizes; nothing for none."""
+    """Return the stamp of the film whose frames are in the folder, and their sizes; empty without such frames."""
     try:
         record = read_json(folder / _RECORD)
         frames = {str(name): int(size) for name, size in record["frames"].items()}
@@ -88,28 +88,28 @@ Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest tim
 
 
 SECONDS_BETWEEN_FILES = 60.0
-"""How often the files of a capture that was returned are looked at. In between, only its folders are: they change when
-a file is added, removed or replaced, but not when one is written in place."""
+"""Interval between checks of the files of a capture that was already returned. In between, only its folders are
+checked: their times change when a file is added, removed or replaced, but not when one is overwritten in place."""
 
 
 @dataclass
 class _Seen:
-    """What a capture held, since when it has not changed, and whether it was returned like this."""
+    """The contents of a capture, the time of the last change, and whether these contents were returned."""
 
     stamp: Stamp
     since: float
-    folders: dict[str, int]  # its folders, or the film, and when they changed, in nanoseconds
+    folders: dict[str, int]  # its folders, or the film, with their modification times in nanoseconds
     looked_at: float  # when the stamp was last compared with the files
     returned: bool = False
 
 
 class Arrivals:
-    """The captures in a folder, its subfolders and films, that are complete and were not returned before.
+    """The complete captures in a folder (its subfolders and films) that were not returned before.
 
-    A capture is complete when it contains a file named `marker`, or, without a marker, and for a film, when nothing in
-    it has changed for `seconds`. Names that begin with a dot are left out, and `without`, such as the folder of the
-    results, which is no capture and lies in none. One that changes after it was returned is returned again; a file that
-    is written in place is noticed within SECONDS_BETWEEN_FILES. `clock` never goes back.
+    A capture is complete when it contains a file named `marker`. Without a marker, and for films, it is complete when
+    nothing in it has changed for `seconds`. Names that begin with a dot are ignored, and so is `without`, such as the
+    folder of the results, which must not be a capture or be inside one. A capture that changes after it was returned is
+    returned again; a file that is overwritten in place is noticed within SECONDS_BETWEEN_FILES. `clock` is monotonic.
     """
 
     def __init__(
@@ -127,10 +127,10 @@ class Arrivals:
         self._seen: dict[Path, _Seen] = {}
 
     def take(self) -> list[Path]:
-        """Return the captures that became complete since the last call, in natural order of their names.
+        """Return the captures that became complete since the last call, sorted naturally by name.
 
-        Of two whose results have one name, such as a folder and a film, the second comes with the next call. Raises
-        InputError if the folder cannot be read; later, all captures in it are returned again.
+        If the results of two captures have the same name, such as a folder and a film, the second is returned by the
+        next call. Raises InputError if the folder cannot be read; afterwards, all its captures are returned again.
         """
         captures, now = self._captures(), self._clock()
         self._seen = {path: self._seen[path] for path in captures if path in self._seen}
@@ -158,7 +158,7 @@ class Arrivals:
             with os.scandir(self.folder) as entries:
                 visible = [(entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."]
         except OSError as error:
-            self._seen.clear()  # a capture that was being read has failed, and is to be tried again
+            self._seen.clear()  # a capture that was being read has failed and must be retried
             raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
         paths = [path for is_dir, path in visible if is_dir or is_film(path)]
         return [path for path in paths if path.resolve() not in self._left_out]
@@ -172,9 +172,9 @@ def _changed(folder: str) -> int:
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
-    """Return the stamp of a film, or of all files below a folder, and the folders; see _Seen.
+    """Return the stamp of a film, or of all files in a folder and its subfolders, and the folders; see _Seen.
 
-    Files that vanish meanwhile do not count.
+    Files that disappear in the meantime are ignored.
     """
     count = size = newest = 0
     folders = {}

@@ -1,7 +1,7 @@
 """Estimate the normals of one capture: read it, check it, run the method, write the results.
 
-From a capture to its normals, with all checks and warnings: for `infer` and for splinecli.estimate_normals. A distilled
-estimator replaces a network on large captures, or where the user asks for it.
+Both `infer` and splinecli.estimate_normals use this code, with all checks and warnings. On large captures, or on
+request, a distilled estimator replaces the network.
 """
 
 from __future__ import annotations
@@ -49,26 +49,27 @@ if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
 
 
-BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
-REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
+BASE_BYTES = 500 * 2**20  # for Python, PyTorch and a batch of pixels; captures and their refinement need more
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # most pixels refined at once (a tile with its margin); bytes per pixel
 
-INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
-_WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
+INDIRECT_BYTES = 4  # per pixel of the capture, for its indirect light
+_WORTH_A_MASK = 10**9  # bytes above which the mask is read, to find out how many of them are needed
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
+    """Return the memory in bytes that spline-net needs for a capture, in addition to BASE_BYTES.
 
-    They follow from the size of the largest image, and the numbers of pixels in the mask and of images that are read.
+    It follows from the size of the largest image, the number of pixels in the mask and the number of images read.
     """
     of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
 
 def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
-    """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
+    """Return the approximate memory in bytes for a capture, from the first image's header and, if large, the mask.
 
-    A capture that cannot be read takes none: it will fail soon. `n_lights` images are read, or all for 0.
+    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images are read; 0 reads
+    all images.
     """
     try:
         source = open_source()
@@ -86,8 +87,8 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
 AUTOMATIC_FROM = 100_000
 """Pixels from which a capture is distilled by default.
 
-Fixed, not timed: the load of a machine must not change normals. From this size on, distillation takes less than half of
-the network's time on 1 to 16 cores and on an H100, under 10 and 96 lights.
+This is a constant and not timed at run time, because the machine's load must not change the normals. From this size on,
+distillation takes less than half of the network's time on 1 to 16 cores and on an H100, under 10 and 96 lights.
 """
 
 
@@ -96,8 +97,8 @@ def distil_for(
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
-    A capture under near lamps has the points of its surface. `wanted` is None for AUTOMATIC_FROM. Raises UsageError if
-    it is wanted, but the method gives no confidence, or the capture is too small.
+    Under near lamps, the capture must contain its surface points. With `wanted` = None, AUTOMATIC_FROM decides. Raises
+    UsageError if distillation is requested, but the method does not estimate a confidence, or the capture is too small.
     """
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
@@ -132,7 +133,7 @@ def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarnin
     return None, []
 
 
-_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # as the clock calls them
+_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # the clock's names
 
 
 def estimate_capture(
@@ -147,12 +148,12 @@ def estimate_capture(
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
-    """Return the normals of a capture, which then has all warnings, and the distilled estimator if there was one.
+    """Return the normals of a capture, with all warnings added to it, and the distilled estimator if one was used.
 
-    The capture has the warnings from reading it. `check` returns those about its lights and images
+    The capture already contains the warnings from reading it. `check` returns the warnings about its lights and images
     (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
-    is called with the number of pixels that were just estimated, in place of the observer. With `strict`, a warning
-    that an input is probably wrong is an InputError. The observer is shown the stages, the clock measures them.
+    is called with the number of pixels just estimated, instead of the observer. With `strict`, a warning that an input
+    is probably wrong becomes an InputError. The stages are reported to the observer and timed by the clock.
     """
     clock = clock or Clock()
     clock.begin("check")
@@ -171,7 +172,7 @@ def estimate_capture(
     with ExitStack() as stages:
 
         def stage(name: str) -> AbstractContextManager[Advance]:
-            stages.close()  # one bar at a time
+            stages.close()  # show only one progress bar at a time
             clock.begin(_STAGES.get(name, "estimate"))
             return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
 
@@ -179,7 +180,7 @@ def estimate_capture(
         estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
     warnings += found
     warnings += [CaptureWarning(UNTRAINED_LIGHTS, text) for text in estimator.warn_of_lights(capture.n_lights)]
-    # Others of these say why the confidence is low.
+    # The other warnings explain why the confidence is low.
     if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict)
@@ -191,11 +192,11 @@ def infer_capture(
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results go to `options.output`/<capture name>/, where they replace earlier ones (see new_files). Meanwhile no
-    other process may write there.
+    The results are written to `options.output`/<capture name>/, replacing earlier ones as new_files does. No other
+    process may write there in the meantime.
 
     Args:
-        estimator: what `make_method(options)` returned; it saves time in a batch.
+        estimator: the result of `make_method(options)`, which can be reused in a batch to save time.
 
     Raises:
         InputError: the capture cannot be read, or with options.strict, its lights or images are probably wrong.
@@ -241,9 +242,9 @@ def infer_capture(
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
-    """Return a digest that changes when any file that is read for the capture, or the weight file, changes.
+    """Return a digest that changes if the weight file or any file that is read for the capture changes.
 
-    `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
+    `loaded` is the SHA-256 of the weight file at the time it was loaded; with None, the file is read.
     """
     if weights is not None and (path := expanded(weights)).is_file():
         weights = loaded or file_sha256(path)
@@ -252,7 +253,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
-    """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
+    """Lock the folder for the results of a capture with held_folder, and yield it. Raises OutputError."""
     target = Path(options.output) / name
     refuse_link(target)
     with held_folder(target, observer.warn):
@@ -260,9 +261,9 @@ def held_results(name: str, options: InferOptions, observer: Observer) -> Iterat
 
 
 def make_method(options: InferOptions) -> Estimator:
-    """Return the estimator that the options ask for. Loading a network takes about a second.
+    """Return the estimator selected by the options. Loading a network takes about a second.
 
-    Raises UsageError if the method uses no weights or gives no confidence, and the options ask for it, or ModelError.
+    Raises UsageError if the options require weights or a confidence that the method does not have, or ModelError.
     """
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:
@@ -289,7 +290,7 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
-    """Raise InputError, before hours of work, for results that take more memory than is left, or an empty mesh."""
+    """Raise InputError, before hours of work, if the results exceed the free memory or the mesh would be empty."""
     costly = [row.name for row in chosen_maps(options.maps, page=options.html) if row.bytes_per_pixel]
     avoidable = [f"--maps {name}" for name in costly if name in options.maps]
     avoidable += ["--html"] * options.html + ["--surface"] * options.surface
@@ -305,7 +306,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 
 
 def _check_light_files(target: Path) -> None:
-    """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
+    """Raise OutputError if the folder of results contains a light file that was not written by an earlier run."""
     own = files.own_light_files(target)
     for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
@@ -324,13 +325,13 @@ def _make_files(
     observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
-    """Compute what the options ask for, put what the report says of the surface into it, and return the files."""
+    """Compute the results that the options request, add the surface to the report, and return the files."""
     capture = estimate.capture
     clock.begin("pictures")
     made: dict[str, NDArray[np.float32]] = {}
     for row in chosen_maps(options.maps, page=options.html):
         if not (row.bytes_per_pixel or (options.html and row.caption)):
-            continue  # it is made when it is written
+            continue  # computed when it is written
         if row.reads_images:
             with observer.progress(f"{capture.name}: {row.name}", capture.n_lights) as advance:
                 values = make_map(row, source, estimate, lambda: advance(1))
@@ -387,14 +388,14 @@ def _map_files(
     formats: Sequence[str],
     scales: Mapping[str, float],
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map, which is made now if it was not made before."""
+    """Yield the files of a map, which is computed now unless it already exists."""
     values = made[row.name] if row.name in made else make_map(row, source, estimate)
     if values is not None:
         yield from map_files(row, values, estimate.capture.mask, formats, scale=scales.get(row.name))
 
 
 def results_bytes(n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False) -> int:
-    """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
-    # What one map needs is free again before the next is made.
+    """Return the memory in bytes that `infer` needs for a capture's results, in addition to its observations."""
+    # The memory of one map is freed before the next is computed.
     each = [MAPS[name].bytes_per_pixel + MAPS[name].bytes_per_observation * n_lights for name in maps]
     return n_pixels * (BYTES_OF_RESULTS + max([*each, BYTES_OF_SURFACE * surface]))

@@ -1,6 +1,6 @@
-"""The options of `infer`, `watch` and `info`: frozen records that can be written as JSON and pickled."""
+"""The options of `infer`, `watch` and `info` as frozen records, which can be pickled and converted to JSON."""
 
-# Options are a table: name, type, panel and kind of value, then what they mean.
+# The options form a table: name, type, panel and kind of value, then the help text.
 # fmt: off
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ from splinecli.system.machine import Device, Precision, count_available_cores
 Redo = Literal["nothing", "changed", "all"]
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
-# Options that several commands have.
+# Options shared by several commands.
 
 
 def complete_weights() -> list[str]:
-    """Return the names of the shipped weights. If none begins with the typed text, the shell completes file names."""
-    # The module that reads this file imports torch, which takes too long for a completion.
+    """Return the names of the shipped weights. If none starts with the typed text, the shell completes file names."""
+    # The module that usually reads this file imports torch, which is too slow for shell completion.
     return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
 
 
@@ -81,7 +81,7 @@ Update = Annotated[bool, Option("Output", "", "Compute changed captures again, a
 
 
 class Display(Record, frozen=True, kw_only=True):
-    """What a command prints."""
+    """The output that a command prints."""
 
     as_json: Annotated[bool, Option("Output", "", "Print one JSON document on stdout, and nothing else.",
         names=("--json",))] = False
@@ -89,14 +89,14 @@ class Display(Record, frozen=True, kw_only=True):
 
 
 def parse_workers(text: str) -> int:
-    """Return a number of processes, 0 for "auto". Raises UsageError."""
+    """Return the number of processes, with 0 for "auto". Raises UsageError."""
     if text != "auto" and (not text.isdecimal() or len(text) > 4 or int(text) < 1):
         raise UsageError(f"--workers is {text!r}; expected a number of at least 1, or auto")
     return 0 if text == "auto" else int(text)
 
 
 class Workers(Record, frozen=True, kw_only=True):
-    """The processes of this machine that do the items of a command; 0 for as many as it can use."""
+    """The number of local processes that work on the items of a command; 0 means as many as the machine can use."""
 
     workers: Annotated[int, Option("Processes and machines", "N|auto",
         "Number of processes of this machine that work side by side (needs the extra 'cluster'). auto chooses by cores"
@@ -104,9 +104,9 @@ class Workers(Record, frozen=True, kw_only=True):
 
 
 class ClusterOptions(Workers, frozen=True, kw_only=True):
-    """Where the items of a command are done: in this process, others of this machine, or a Dask cluster."""
+    """Where the items of a command are processed: in this process, in other local processes, or on a Dask cluster."""
 
-    # the address of a Dask scheduler, or its scheduler file
+    # the address or the scheduler file of a Dask scheduler
     address: Annotated[str | None, Option("Processes and machines", "ADDRESS|FILE",
         "Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file (needs"
         " the extra 'cluster').", names=("--cluster",))] = None
@@ -120,9 +120,9 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
             )
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
-        """Return these options with a process for each core in place of 0, and at most one for each item.
+        """Return these options with 0 replaced by one process per core, limited to one process per item.
 
-        Return None where this process can do the items as well.
+        Return None if other processes would not be faster than this one.
         """
         if self.address is not None:
             return self
@@ -136,9 +136,9 @@ HERE = ClusterOptions()
 
 
 class Reading(Record, frozen=True, kw_only=True):
-    """Which files make a capture, and how they are read: options of `infer` and `info`, as their help describes them.
+    """The options of `infer` and `info` that select the files of a capture and how to read them.
 
-    None is the default in the help. Raises UsageError.
+    The help describes each option. None stands for the default given there. Raises UsageError.
     """
 
     mask: Annotated[FileName | None, Option("Input", "FILE",
@@ -188,11 +188,11 @@ class Reading(Record, frozen=True, kw_only=True):
         " frame of its viewing ray.", default="camera_matrix.txt in CAPTURE, or orthographic")] = None
     strict: Annotated[bool, Option("Output", "",
         "Fail (exit code 3) where a warning says that the lights or the images are probably wrong.")] = False
-    surface = False  # is made of the capture, too, in the unit of pixel_size; a field of InferOptions
+    surface = False  # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # These concern a light file or near lamps.
+        # These options apply to a light file or to near lamps.
         reasons = {
             "--light-positions": self.light_positions is not None and "finds distant lights",
             "--light-distance": self.light_distance is not None and "finds distant lights",
@@ -217,17 +217,17 @@ class Reading(Record, frozen=True, kw_only=True):
 
     @property
     def finds_lights(self) -> bool:
-        """Whether the lights are found from the images."""
+        """Whether the lights are estimated from the images."""
         return self.lights == ESTIMATE
 
     @property
     def light_file(self) -> str | None:
-        """The light file that replaces that of the capture."""
+        """The light file that overrides the capture's own."""
         return None if self.finds_lights else self.lights
 
     @property
     def lamps(self) -> LampOptions:
-        """The part of the options that concerns near lamps. Raises UsageError."""
+        """The options for near lamps. Raises UsageError."""
         return LampOptions(
             positions=self.light_positions,
             distance=self.light_distance,
@@ -238,7 +238,7 @@ class Reading(Record, frozen=True, kw_only=True):
         )
 
     def check_files(self) -> None:
-        """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
+        """Raise InputError if a file named in the options does not exist, or --flat-field contains no images."""
         intensities = None if self.intensities == EQUAL else self.intensities
         named = (self.light_file, self.light_positions, intensities, self.camera_matrix, self.mask)
         for name in (*named, self.ground_truth, self.ambient):
@@ -247,7 +247,7 @@ class Reading(Record, frozen=True, kw_only=True):
         self.radiometric_calibration()
 
     def radiometric_calibration(self) -> RadiometricCalibration:
-        """Return how the images' values become linear light. Raises InputError."""
+        """Return the conversion of image values to linear light. Raises InputError."""
         flats: tuple[Path, ...] = ()
         if self.flat_field is not None:
             folder = Path(self.flat_field)
@@ -257,7 +257,7 @@ class Reading(Record, frozen=True, kw_only=True):
         return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC)
 
     def open(self, folder: Path) -> CaptureSource:
-        """Open the capture in the folder under these options. Raises InputError."""
+        """Open the capture in the folder with these options. Raises InputError."""
         find: LightFinder | None = None
         if self.finds_lights:
             from splinecli.lights.unknown_lights import find_lights
@@ -280,13 +280,13 @@ class Reading(Record, frozen=True, kw_only=True):
         )
 
 
-_SCALE = {f"{name}_scale": "--maps" for name in SCALED_MAPS}  # fields that come with the names of the maps
+_SCALE = {f"{name}_scale": "--maps" for name in SCALED_MAPS}  # fields that accompany the names of the maps
 
 
 class InferOptions(Reading, frozen=True, kw_only=True):
-    """The options of `infer`, as its help describes them. Raises UsageError if a value is wrong or two contradict."""
+    """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options conflict."""
 
-    # The defaults follow; light_indices count from 0, and the scales are the values that are white in the pictures.
+    # The defaults follow. light_indices are zero-based, and the scales are the values shown as white in the pictures.
     auto_mask: Annotated[bool, Option("Input", "",
         "If there is no mask, find the object in the images and write found_mask.png.")] = False
     as_stored: AsStored = False
@@ -343,7 +343,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """See Record. --maps also gives scales, and the seed counts only for lights that are drawn."""
+        """See Record. --maps also sets scales, and the seed only applies if the lights are drawn at random."""
         scales, names = {}, []
         for item in (given["maps"] or "").split(","):
             name, colon, scale = (part.strip() for part in item.partition(":"))
@@ -360,7 +360,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         return super().from_arguments(given).replace(**scales)
 
     def changes(self, earlier: InferOptions) -> list[str]:
-        """Return the options that give other results than earlier ones; --output and --device do not."""
+        """Return the options that affect the results, which excludes --output and --device."""
         kinds = {name: kind for name, kind in field_types(type(self)).items() if name not in ("output", "device")}
         names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
         options = {name: option_of(kinds[name]) for name in names}
@@ -368,23 +368,23 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     @property
     def method_options(self) -> MethodOptions:
-        """The part of the options that concerns the method."""
+        """The options for the method."""
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     def check_files(self) -> None:
-        """See Reading. Raise UsageError, too, if a package that the options need is not installed."""
+        """See Reading. Also raise UsageError if a package required by the options is not installed."""
         super().check_files()
         check_exr(self.formats)
 
 
 def check_pixel_size(pixel_size: float) -> None:
-    """Raise UsageError for a pixel size (mm) out of the range of a surface."""
+    """Raise UsageError if a pixel size (mm) is out of range for a surface."""
     if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
         raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
 
 
 def parse_indices(text: str, option: str) -> tuple[int, ...]:
-    """Return the whole numbers of "0,5,12". Raises UsageError."""
+    """Return the integers in a text such as "0,5,12". Raises UsageError."""
     try:
         return tuple(int(item) for item in text.split(","))
     except ValueError:
@@ -399,7 +399,7 @@ class Shard(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Return the shard of "3/8". Raises UsageError."""
+        """Return the shard for a text such as "3/8". Raises UsageError."""
         found = re.fullmatch(r"([0-9]{1,18})/([0-9]{1,18})", text)
         if found is None:
             raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
@@ -413,7 +413,7 @@ class Shard(NamedTuple):
 
 
 class BatchOptions(Record, frozen=True, kw_only=True):
-    """The captures of `infer`, what is computed again, and what is printed."""
+    """The captures of `infer`, whether existing results are computed again, and the printed output."""
 
     captures: Annotated[tuple[Path, ...], Option("Arguments", "CAPTURE",
         "Folders with the images of one object each, or films.", repeated=True)]
@@ -436,12 +436,12 @@ class BatchOptions(Record, frozen=True, kw_only=True):
 
     @property
     def redo(self) -> Redo:
-        """Which captures are computed that have results."""
+        """Which captures with existing results are computed again."""
         return "all" if self.overwrite else "changed" if self.update else "nothing"
 
 
 class WatchOptions(Record, frozen=True, kw_only=True):
-    """The options of `watch`, as its help describes them."""
+    """The options of `watch`; see its help."""
 
     folder: Annotated[Path, Option("Arguments", "FOLDER",
         "Folder in which captures arrive, a subfolder or film for each.")]
@@ -454,7 +454,7 @@ class WatchOptions(Record, frozen=True, kw_only=True):
 
 
 class InfoOptions(Display, frozen=True, kw_only=True):
-    """The options of `info` beside those of Reading, as its help describes them."""
+    """The options of `info` in addition to Reading; see its help."""
 
     capture: Annotated[Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")]
     auto_mask: Annotated[bool, Option("Input", "", "If there is no mask, find the object in the images.")] = False

@@ -1,4 +1,4 @@
-"""What `info` does: a capture in, a report out of what `infer` would read and need."""
+"""Report on a capture: the data that `infer` would read, and the resources that it would need."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from splinecli.pipeline.infer_options import Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
-# Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
+# Pixels per second on a laptop's processor; benchmarks/inference_speed.py measures the speed of your machine.
 PIXELS_PER_SECOND = 2000  # of spline-net
 DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
 
@@ -35,7 +35,7 @@ ORIGINS = {
     "images": "found in the images",
     "full scale": "the full scale of the files",
 }
-"""The sources of a white level, for people."""
+"""The sources of a white level, as human-readable text."""
 
 
 def describe_capture(
@@ -49,14 +49,14 @@ def describe_capture(
     auto_mask: bool = False,
     mended_lights: Path | None = None,
 ) -> dict[str, Any]:
-    """Read a capture without estimating normals, write the plot and the mended lights, and return the report.
+    """Read a capture without estimating normals, write the plot and the corrected lights, and return the report.
 
     Args:
-        reading: how `infer` would read it. With its `strict`, what could not be checked is a warning, too.
+        reading: how `infer` would read the capture. With `reading.strict`, skipped checks are also warnings.
         plot, overwrite, check_lights, auto_mask, mended_lights: as in the help of `info`.
 
     Raises:
-        InputError: the folder has no capture, or a file cannot be read.
+        InputError: the folder does not contain a capture, or a file cannot be read.
         OutputError: a file exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or options contradict each other.
     """
@@ -64,9 +64,9 @@ def describe_capture(
     for name, given in (("--check-lights", check_lights), ("--mended-lights", mended_lights is not None)):
         if given and reading.finds_lights:
             raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
-    with TemporaryDirectory() as frames:  # of a film
+    with TemporaryDirectory() as frames:  # extracted from a film
         source = reading.open(unpacked(capture, Path(frames), reading, observer, redo="all"))
-        common_size(source.facts)  # as infer
+        common_size(source.facts)  # as in `infer`
         if auto_mask:
             with observer.progress("finding the object", source.n_lights) as advance:
                 source = source.find_mask(lambda: advance(1))
@@ -118,7 +118,7 @@ def describe_capture(
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for people."""
+    """Return the lines of the human-readable report."""
     types = {"uint8": "8 bits", "uint16": "16 bits"}
     kinds = ", ".join(
         f"{kind['size'][0]} x {kind['size'][1]}, {'gray' if kind['channels'] == 1 else 'RGB'},"
@@ -161,7 +161,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _camera_in_words(report: dict[str, Any]) -> str | None:
-    """Return what is known of the camera, for people; None for nothing."""
+    """Return a human-readable description of the camera, or None if nothing is known about it."""
     matrix, of_exif = report["camera_matrix"], report["exif_camera_matrix"]
     if matrix is not None:
         return f"perspective, focal length {matrix[0][0]:.6g} pixels"
@@ -172,7 +172,7 @@ def _camera_in_words(report: dict[str, Any]) -> str | None:
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
-    """Return the table of readings of the light file; nothing if it was not asked for."""
+    """Return the table of interpretations of the light file; empty unless it was requested."""
     if not candidates:
         return []
     width = max(30, *(len(row["reading"]) + 2 for row in candidates))
@@ -192,7 +192,7 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
 
 
 def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
-    """Return the summary with the lights that are found from its sample, and these; None where files give them."""
+    """Return the summary with the lights estimated from its sample, and these lights; None if files provide them."""
     source = summary.source
     if source.find_lights is None or summary.samples is None:
         return summary, None
@@ -214,7 +214,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
     if intensities is None and source.intensities_measured and (source.light_intensities != 1).any():
-        intensities = files.light_directions  # the light files of AliceVision have both
+        intensities = files.light_directions  # AliceVision's light files contain both
     return {
         "capture": files.name,
         "layout": files.layout,
@@ -255,16 +255,16 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "expect": {
             "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
-            # 50,000 pixels a second: integration, mesh and their files on one core
+            # 50,000 pixels per second: integration, mesh and their files on one core
             "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
 
 
 def _seconds(summary: CaptureSummary) -> float:
-    """Return the time of spline-net on a capture, distilled from the size where `infer` does so."""
+    """Return the runtime of spline-net on a capture, with distillation if `infer` would use it at this size."""
     count = summary.n_pixels
     if count < AUTOMATIC_FROM:
         return count / PIXELS_PER_SECOND
-    # The network sees and learns 1000 pixels of the sample a second.
+    # Estimation on the sample and training on it together process 1000 pixels per second.
     return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND

@@ -1,4 +1,4 @@
-"""The surface of a normal map, which `infer` makes, too, and what `integrate` does with it."""
+"""Integrate normal maps: compute the surface, as `infer` also does, and write its files."""
 
 import json
 import math
@@ -55,12 +55,12 @@ def make_surface(
     prior_detail: float | None = None,
     progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Surface, dict[str, Any]]:
-    """Return the surface of a normal map, and what the reports say of it.
+    """Return the surface of a normal map, and its entry in the reports.
 
-    Arguments and errors are those of integrate_normals, surface_mesh and decimated_mesh. Without `n_triangles`, the
-    mesh keeps all. `pixel_size_mm` is the width of a pixel on the object, for a surface in millimetres; None for one in
-    pixels, or, with a camera matrix, in mean depths. The prior is in the unit of the surface. With a camera matrix this
-    is the millimetre, so that pixel_size_mm is not needed.
+    The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. Without
+    `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on the object and gives a
+    surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean depth. The prior is in
+    the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is not needed.
     """
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
@@ -103,10 +103,10 @@ def make_surface(
 def view_of_report(
     report: Mapping[str, Any], camera_matrix: NDArray[np.floating] | None = None, pixel_size_mm: float | None = None
 ) -> tuple[NDArray[np.float64] | None, float | None]:
-    """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
+    """Return the camera matrix and the pixel size in millimetres of the normal map described by a report of `infer`.
 
-    `camera_matrix` and `pixel_size_mm` are those of the photographs, in place of those of the report. Raises KeyError,
-    TypeError, ValueError or UsageError if it is no report of this version of `infer`.
+    `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the report. Raises KeyError,
+    TypeError, ValueError or UsageError if the document is not a report from this version of `infer`.
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
@@ -115,8 +115,8 @@ def view_of_report(
     if lamps is not None and lamps["camera"] == "perspective":
         seen = lamps["camera_matrix"]
     if matrix is None and seen is not None:
-        matrix = np.array(seen, np.float64).reshape(3, 3)  # of what the window reads
-    # Without a surface, it only scaled near lamps, whose unit may be any.
+        matrix = np.array(seen, np.float64).reshape(3, 3)  # of the part of the image that the window covers
+    # Without a surface, the pixel size only scaled near lamps, which may be in any unit.
     if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
     if pixel_size_mm is not None:
@@ -142,7 +142,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
 
 
 def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
-    """Do the work of integrate_normal_map in the folder of results, which the caller holds."""
+    """Run integrate_normal_map in the folder of results, which the caller has locked."""
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
@@ -207,7 +207,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
-    """Return the line that tells people what was written."""
+    """Return a one-line summary of the files that were written."""
     unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[report["unit"]]
     low, high = report["range"]
     return (
@@ -216,7 +216,7 @@ def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the files of a surface that an earlier `integrate` wrote into the folder. Those of `infer` stay."""
+    """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer` are kept."""
     try:
         named = read_json(folder / SURFACE_REPORT)["files"]
         return [name for name in file_names(tuple(SURFACE_FILES)) if name in named]
@@ -239,7 +239,7 @@ def _find_normal_map(folder: Path) -> Path:
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
-    """Return the report of the `infer` that wrote a normal map; None for a normal map from elsewhere."""
+    """Return the report of the `infer` run that wrote a normal map, or None if it has another origin."""
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:

@@ -1,6 +1,6 @@
-"""The options of the commands that work on no single capture: frozen records, as their help describes them."""
+"""The options of the commands that are not for individual captures, as frozen records. See their help."""
 
-# Options are a table: name, type, panel and kind of value, then what they mean.
+# The options form a table: name, type, panel and kind of value, then the help text.
 # fmt: off
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ from splinecli.training import defaults
 DEFAULT_TRIALS = 100
 TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
 DEFAULT_LIGHTS = 10
-_MOST_DIGITS = 18  # of a number of images
+_MOST_DIGITS = 18  # in a number of images
 
 
 def parse_circle(text: str) -> tuple[float, float, float]:
-    """Return the numbers of "X,Y,R". Raises UsageError."""
+    """Return the numbers in a text "X,Y,R". Raises UsageError."""
     try:
         x, y, radius = (float(word) for word in text.split(","))
         if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
@@ -182,7 +182,7 @@ def parse_skip(text: str) -> tuple[str, int]:
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Return the row and the column of "120,85". Raises UsageError."""
+    """Return the row and the column for a text such as "120,85". Raises UsageError."""
     indices = parse_indices(text, "--pixel")
     if len(indices) != 2 or min(indices) < 0:
         raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
@@ -192,8 +192,8 @@ def parse_pixel(text: str) -> tuple[int, int]:
 class EvaluateOptions(Display, frozen=True, kw_only=True):
     """The options of `evaluate`.
 
-    The method "all" stands for all methods. None among the numbers of lights stands for all lights; without any, there
-    are DEFAULT_LIGHTS, or as many as in the draws file.
+    The method "all" stands for all methods. None among the numbers of lights stands for all lights. Without any number,
+    DEFAULT_LIGHTS is used, or the number in the draws file.
     """
 
     datasets: Annotated[tuple[Path, ...], Option("Arguments", "DATASET",
@@ -280,17 +280,17 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
 
     @property
     def names(self) -> list[str]:
-        """The names of the methods, each once."""
+        """The names of the methods, without duplicates."""
         return list(dict.fromkeys(n for name in self.methods for n in (method_names() if name == "all" else [name])))
 
     @property
     def method_options(self) -> MethodOptions:
-        """The part of the options that concerns the methods."""
+        """The options for the methods."""
         return MethodOptions(self.weights, self.rotations, device=self.device, precision=self.precision)
 
     @property
     def protocols(self) -> list[Protocol]:
-        """One protocol for each number of lights and each light noise. Raises UsageError."""
+        """One protocol for each combination of number of lights and light noise. Raises UsageError."""
         from splinecli.lights.light_fit import LIGHT_ERROR_DEG
 
         usual = TRIALS_OF_MANY if len(self.names) >= MANY_METHODS else DEFAULT_TRIALS
@@ -342,7 +342,7 @@ def parse_light_counts(text: str) -> dict[str, int]:
     """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
 
     The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
-    no such range, or a pixel would have fewer than 3 lights.
+    not a valid range, or a pixel would have fewer than 3 lights.
     """
     low, dash, high = text.partition("-")
     try:

@@ -1,4 +1,4 @@
-"""What `prepare` does: captures with ground truth and rendered scenes become a pixel set."""
+"""Build a pixel set from captures with ground truth and from rendered scenes."""
 
 from dataclasses import replace
 from functools import partial
@@ -29,14 +29,14 @@ from splinecli.system.publishing import held_folder
 
 
 def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Write a pixel set, or add to it, and return its summary, the values that `prepare --json` prints.
+    """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
-    A capture that cannot be used is left out, and the observer receives the error; `skipped` of the summary has the
-    reason and an exit code. Every other error ends the work. The same call then continues where it stopped.
+    A capture that cannot be used is left out, and the observer receives the error; `skipped` in the summary holds the
+    reason and an exit code. Any other error stops the work; calling the function again resumes where it stopped.
 
     Raises:
         InputError: a mesh cannot be used.
-        OutputError: the set cannot be written, or has a scene that was rendered with other settings.
+        OutputError: the set cannot be written, or contains a scene that was rendered with other settings.
         UsageError: there is nothing to prepare, or the packages of the extra `render` are not installed.
     """
     output, config = options.output, SceneConfig()
@@ -73,7 +73,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
             _render_scenes(writer, plan, cluster, observer, advance)
         pixel_set = PixelSet(output, ())
         if len(writer):
-            # Before the set counts as finished, so that a finished set has its own overview.
+            # Written before the set is marked as finished, so that a finished set always has its own overview.
             write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
             pixel_set = writer.finish()
     return {
@@ -91,9 +91,10 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
 def _render_scenes(
     writer: PixelSetWriter, plan: ScenePlan, cluster: ClusterOptions | None, observer: Observer, advance: Advance
 ) -> None:
-    """Render the scenes that the set does not have, and add them in the order of the plan, here or on workers.
+    """Render the scenes missing from the set, in this process or on workers, and add them in the order of the plan.
 
-    Raises LostError if the workers of a scene were lost, after all other scenes, or what a worker or the set raises.
+    Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any error from a worker
+    or the set.
     """
     reached = 0.0
 
@@ -119,7 +120,7 @@ def _render_scenes(
         return
     in_set = ((position, None) for position in positions if position not in missing)
     rendered: dict[int, str | LostError | None] = {}
-    # A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
+    # A worker writes a scene to a hidden file of the set. Only this process adds it to the set.
     render = partial(_render, plan, writer.folder)
     position = 0
     try:
@@ -149,7 +150,7 @@ def _path(folder: Path, position: int) -> Path:
 
 
 def _render(plan: ScenePlan, folder: Path, position: int) -> str:
-    """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
+    """Render a scene on a worker, write it to its hidden file, and return its shape."""
     plan.check_inputs()
     shape, pixels = plan.render(position)
     save_rendered(pixels, _path(folder, position))

@@ -1,4 +1,4 @@
-"""What `infer` leaves for a capture: its report, and its files, of which all are written or none."""
+"""Write the results of `infer` for a capture: the report and the files, either all of them or none."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def report_of(
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds`, `folder` and `files`. The options are those of `infer`, ready for JSON. `inputs` is a
-    digest that changes when an input file changes. `light_file` is None where the lights were found from the images,
-    and `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
+    write_estimate adds `seconds`, `folder` and `files`. The options are the options of `infer` as JSON values. `inputs`
+    is a digest that changes when an input file changes. `light_file` is None if the lights were estimated from the
+    images. `distillation` is the result of DistilledEstimator.report, or None if the method estimated every pixel.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
@@ -94,7 +94,7 @@ def report_of(
 
 
 def peak_memory_mib() -> int | None:
-    """Return the largest memory that this process has used in MiB, or None if the system does not report it."""
+    """Return the peak memory usage of this process in MiB, or None if the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -103,27 +103,27 @@ def peak_memory_mib() -> int | None:
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
-Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
+Files = Iterator[tuple[str, Content]]  # names and contents, each computed on demand
 
 
 class UnfinishedError(ValueError):
-    """A folder has no whole set of results."""
+    """A folder does not contain a complete set of results."""
 
 
 def write_estimate(
     report: dict[str, Any], folder: Path, files: Iterable[tuple[str, Content]], clock: Clock
 ) -> dict[str, Any]:
-    """Write the results of a capture into `folder` and return the finished report; `report` is that of report_of.
+    """Write the results of a capture to `folder` and return the finished report; `report` comes from report_of.
 
-    The files, of own_files() and FOUND_LIGHTS, replace those of an earlier run in the folder (see new_files), which the
-    caller holds. Writing is the last stage of the clock. Raises OutputError if a file cannot be written.
+    The files, which are named in own_files() and FOUND_LIGHTS, replace the files of an earlier run (see new_files). The
+    caller has locked the folder. Writing is the clock's last stage. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in own_files() if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
             new.write(name, content)
-            del content  # before the next one is made
+            del content  # before the next one is computed
         report = {
             **report,
             "seconds": clock.seconds(),
@@ -136,7 +136,7 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return those of FOUND_LIGHTS in a folder of results that an earlier run wrote, as its report says."""
+    """Return the FOUND_LIGHTS in a folder of results that, according to its report, an earlier run wrote."""
     try:
         return [name for name in FOUND_LIGHTS if name in read_report(folder)["files"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -144,12 +144,12 @@ def own_light_files(folder: Path) -> list[str]:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Return the report of a folder of results whose files are as it states. Links in the folder are not followed.
+    """Return the report in a folder of results if its list of files is correct. Links are not followed.
 
-    Apart from the files, what the report says is not checked.
+    The rest of the report is not checked.
 
     Raises:
-        UnfinishedError: there is no report, or a file is missing or has another size.
+        UnfinishedError: the report or a file is missing, or a file has another size.
         OSError, ValueError, KeyError, TypeError, AttributeError: the report cannot be used.
     """
     if not is_plain(folder / REPORT):
@@ -158,7 +158,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     files, sizes = report["files"], report.get("file_sizes", {})  # earlier versions stated no sizes
     if not (isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)):
         raise ValueError("the report has no list of files, or no sizes")
-    # The mask is made to be edited, and `integrate` may have replaced the surface.
+    # Users may edit the mask, and `integrate` may have replaced the surface.
     changeable = (FOUND_MASK, *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()))
     for name in files:
         path = folder / name
@@ -172,7 +172,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
-    """Yield the normal map in some formats, which are keys of NORMALS, and the error map if there is one."""
+    """Yield the normal map in the given formats, which are keys of NORMALS, and the error map if available."""
     for form in formats:
         yield NORMALS[form], encode_normals(estimate, form, convention)
     if estimate.error_map_deg is not None:
@@ -182,7 +182,7 @@ def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: C
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
     """Return the file of the normal map: a 16-bit or 8-bit PNG picture, or float32 NPY, TIFF or EXR.
 
-    EXR has the colours of the pictures, (n + 1) / 2 and black outside the mask, because renderers expect them.
+    EXR has the same colours as the pictures, (n + 1) / 2 and black outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
         bits = 8 if form == "png8" else 16
@@ -202,7 +202,7 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
-    """Yield lights that were found from the images, as `--lights` and `--intensities` read them, and their plot."""
+    """Yield the lights estimated from the images, in the format of `--lights` and `--intensities`, and their plot."""
     yield FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if capture.estimated_intensities is not None:
         yield FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))

@@ -1,4 +1,4 @@
-"""The maps of MAPS from the normals and the images of a capture, and their files."""
+"""Compute the maps listed in MAPS from the normals and the images of a capture, and their files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Progress = Callable[[], object]
 
 
 def chosen_maps(names: Collection[str], *, page: bool = False) -> list[OutputMap]:
-    """Return the rows with these names, and those that the page has; those that take most memory come last."""
+    """Return the rows with these names and the rows shown on the page, with the most memory-intensive ones last."""
     rows = [row for row in MAPS.values() if row.name in names or (page and row.caption)]
     return sorted(rows, key=lambda row: row.bytes_per_pixel)
 
@@ -34,13 +34,13 @@ def chosen_maps(names: Collection[str], *, page: bool = False) -> list[OutputMap
 def make_map(
     row: OutputMap, source: CaptureSource, estimate: NormalEstimate, progress: Progress = lambda: None
 ) -> NDArray[np.float32] | None:
-    """Return the values of a map, or None where the capture or the method has none. Raises InputError."""
+    """Return the values of a map, or None if the capture or the method does not provide it. Raises InputError."""
     found: NDArray[np.float32] | None = resolve_name(row.make)(source, estimate, progress)
     return found
 
 
 def map_picture(row: OutputMap, values: Floats, mask: NDArray[np.bool_], scale: float | None = None) -> Picture:
-    """Return the picture of a map's values (H, W) or (H, W, C); None is the row's own scale."""
+    """Return a picture of a map's values (H, W) or (H, W, C); None uses the row's own scale."""
     scales = [] if row.scale is None else [row.scale if scale is None else scale]
     picture: Picture = resolve_name(row.picture)(values, mask, *scales)
     return picture
@@ -54,7 +54,7 @@ def map_files(
     *,
     scale: float | None = None,
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map: always NPY and PNG if it has them, TIFF and EXR if they are among the formats."""
+    """Yield the files of a map: NPY and PNG whenever the map has them, TIFF and EXR only if they are requested."""
     scale = row.scale if scale is None else scale
     for suffix, name in row.files.items():
         if suffix == "npy":
@@ -105,12 +105,12 @@ def albedo_map(
     """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
 
     A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
-    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known up
-    to one factor for the whole capture unless the intensities are absolute.
+    the pixel's median of I / (n.l). Its scale is the scale of the images divided by the light intensities, so it is
+    known up to one factor for the whole capture unless the intensities are absolute.
 
     The images of the source are read again, one at a time, for their colours; `progress` is called after each. The
-    capture is what the source read; under near lamps, with the points of its surface. The normal map (H, W, 3) is unit
-    in its mask. Raises InputError if an image can no longer be read.
+    capture must have been read from this source; under near lamps, it must contain its surface points. The normal map
+    (H, W, 3) has unit length in its mask. Raises InputError if an image can no longer be read.
     """
     normals = take_pixels(normal_map, capture.mask)
     counts = np.empty(capture.observations.shape, np.bool_)
@@ -130,7 +130,7 @@ def albedo_map(
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
         if capture.restored is not None:
-            # The colour of a restored observation is saturated, so the others decide.
+            # The colour of a restored observation is saturated, so only the other observations are used.
             weight = cosine * np.where(capture.restored[:, position], np.float32(1e-3), np.float32(1))
         colours *= weight[:, None]  # in place, because large captures need the memory
         total += colours
@@ -144,7 +144,7 @@ def albedo_map(
 def _shading(
     capture: Capture, normals: NDArray[np.float32], pixels: slice, positions: Sequence[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) of some pixels under K lights, and the lights' attenuation (p, K), (1, 1) if distant."""
+    """Return n.l (p, K) for some pixels under K lights, and the lights' attenuation (p, K), or (1, 1) if distant."""
     if capture.lamps is None:
         lights = capture.light_directions[list(positions)].astype(np.float32)
         return normals[pixels] @ lights.T, np.ones((1, 1), np.float32)
@@ -155,12 +155,12 @@ def _shading(
 
 def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
-    lit = cosine > 0.15  # others graze
+    lit = cosine > 0.15  # excludes grazing light
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
     # The median of the lit observations, which sorting moves to the front.
     ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
     middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
     with np.errstate(invalid="ignore"):
-        # Others are highlights or in cast shadow.
+        # The other observations are highlights or in cast shadow.
         close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= 0.3 * middle)
     return close

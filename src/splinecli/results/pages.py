@@ -1,4 +1,4 @@
-"""HTML pages of results: one for each capture, with a view under a movable light, and their overview, index.html."""
+"""HTML pages of results: one with interactive relighting for each capture, and their overview, index.html."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from splinecli.system.machine import is_out_of_memory
 
 
 def picture_url(file: bytes, kind: str = "png") -> str:
-    """Return a data URL of a PNG or JPEG file, so that a page contains it."""
+    """Return a data URL that embeds a PNG or JPEG file in a page."""
     return f"data:image/{kind};base64,{base64.b64encode(file).decode('ascii')}"
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page that a template makes of the values. Values are escaped; a missing value is an error."""
+    """Return the page rendered from a template and its values. Values are escaped; a missing value is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -44,12 +44,12 @@ def render(template: str, **values: object) -> str:
 
 
 LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
-LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
-QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page begins with maps of the second
+LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side length
+QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page initially shows maps with the second
 
 LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
 
-_LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # stands for a component of 1
+_LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # represents a component of 1
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
@@ -64,19 +64,19 @@ def result_page(
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
 
-    Maps over LARGEST_MAP or LONGEST_SIDE are reduced, with their proportions kept. A pixel of a reduced map is the mean
-    of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit length. The page
-    states its size then. The figures on the page are those of the report, over all pixels. Raises OutputError if a
-    picture cannot be encoded.
+    Maps that exceed LARGEST_MAP or LONGEST_SIDE are reduced, keeping their aspect ratio, and the page then states the
+    reduced size. A pixel of a reduced map is the mean of the values in its area that are in the mask (or have an
+    error); mean normals are rescaled to unit length. The figures on the page are taken from the report and cover all
+    pixels. Raises OutputError if a picture cannot be encoded.
 
     Args:
         report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths on
-            the page are in millimetres if its surface is, else in pixels of the whole maps.
+            the page are in millimetres if the surface is, otherwise in pixels of the full-size maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
-        values: (H, W) or (H, W, C), by name, of the maps of MAPS that the page shows.
-        error_map_deg: (H, W) degrees, NaN where there is no error.
-        light_plot: a PNG of the lights, where they were found from the images.
+        values: (H, W) or (H, W, C), by name, for the maps in MAPS that the page shows.
+        error_map_deg: (H, W) degrees, NaN where the error is unknown.
+        light_plot: a PNG of the lights, if they were estimated from the images.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
     values = values or {}
@@ -132,7 +132,7 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
     """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the LOW_BITS below.
 
     The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel that is black in
-    the first picture is outside, since no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
+    the first picture must be outside, because no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
     because a browser would multiply the colours by it.
     """
     codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
@@ -142,7 +142,7 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
 def _first_pictures(
     maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
 ) -> dict[str, Picture]:
-    """Return the pictures of the maps in few pixels, which a browser shows while it reads the others."""
+    """Return low-resolution pictures of the maps, which a browser shows while it loads the others."""
     import cv2
 
     small, known = _reduce(normals, mask, FIRST_MAP)
@@ -156,7 +156,7 @@ def _first_pictures(
 def _reduce(
     values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return values (H, W, C) and their mask, reduced to `largest` pixels and sides of LONGEST_SIDE.
+    """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at most LONGEST_SIDE.
 
     A reduced value is the mean of the known values in its area, and is known if one of them is.
     """
@@ -169,7 +169,7 @@ def _reduce(
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
     total = cv2.resize(np.where(known[..., None], values, 0), size, interpolation=cv2.INTER_AREA)
-    total = total.reshape(*weight.shape[:2], -1)  # OpenCV drops an axis of one channel
+    total = total.reshape(*weight.shape[:2], -1)  # OpenCV drops the axis if there is only one channel
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
@@ -179,7 +179,7 @@ def _size(mask: NDArray[np.bool_]) -> str:
 
 
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
-    """Return terms and values; `reduced` is the size of the page's maps if they were reduced."""
+    """Return pairs of terms and values; `reduced` is the size of the page's maps if they were reduced."""
     weights, expected = report["weights"], report["expected_under_5"]
     seconds = report["seconds"].items()  # of the stages up to this page
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
@@ -226,7 +226,7 @@ HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warning
 
 
 class Entry(NamedTuple):
-    """What the page shows of one capture: its row, the names of its files, and its warnings."""
+    """The page's entry for one capture: its row, the names of its files, and its warnings."""
 
     row: Row
     files: tuple[str, ...] = ()
@@ -234,7 +234,7 @@ class Entry(NamedTuple):
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Entry:
-        """Return the entry of a report (see report_of), or of a document with `capture` and `error`."""
+        """Return the entry for a report (see report_of), or for a document with `capture` and `error`."""
         if "error" in report:
             return cls(Row(report["capture"], error=report["error"]))
         errors, expected, seconds = report["angular_error_deg"], report["expected_under_5"], report["seconds"]
@@ -251,10 +251,10 @@ class Entry(NamedTuple):
 
 
 def index_page(entries: Sequence[Entry], output: Path) -> str:
-    """Return the page that shows small normal maps and links the files, for the folder of the captures' folders."""
+    """Return the overview page with small normal maps and links to the files, for the folder above the captures."""
     rows = []
     for row, files, words in entries:
-        # As bytes, because a folder's name may not be valid text.
+        # Quote the bytes, because a folder's name may not be valid text.
         folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
         rows.append(
@@ -271,11 +271,11 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None where it cannot be read."""
+    """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None if it cannot be read."""
     import cv2
 
     try:
-        # 33 megapixels of 16 bits; larger ones may be bombs.
+        # 33 megapixels of 16 bits; larger files may be decompression bombs.
         if image_bytes(*read_facts(path).size) > 10**9:
             return None
         picture = decode_image(path)
@@ -292,7 +292,7 @@ def _thumbnail(path: Path) -> str | None:
 
 
 def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
-    """Return the entries, followed by those of other captures that have results in the folder, sorted by name."""
+    """Return the entries, followed by entries for other captures with results in the folder, sorted by name."""
     names = {entry.row.capture for entry in entries}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
@@ -300,7 +300,7 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
             continue
         try:
             entry = Entry.of(read_report(path.parent))
-        except Exception as error:  # a report of somebody else may be wrong in any way
+        except Exception as error:  # a report from elsewhere may be invalid in any way
             if is_out_of_memory(error):
                 raise
             continue
