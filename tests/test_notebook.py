@@ -109,6 +109,7 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
     ("change", "error", "message"),
     [
         ({"images": np.ones((4, 5))}, UsageError, "found images of shape"),
+        ({"images": np.ones((8, 0, 0))}, UsageError, "found images of shape"),
         ({"images": np.ones((4, 5, 6, 2))}, UsageError, "expected (F, H, W) or (F, H, W, 3)"),
         ({"images": np.ones((4, 5, 6), np.int64)}, UsageError, "found images of type int64"),
         ({"images": []}, UsageError, "found no images"),

@@ -351,5 +351,5 @@ def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch
 
 def test_images_in_place_of_their_folder(run, capture):
     result = run("infer", *sorted(capture.glob("image*.png")), "--method", "ls")
-    expected = "splinecli: 8 images were given, expected their folder. Pass the folder: sphere.\n"
+    expected = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
     assert (result.code, result.err) == (2, expected)

@@ -319,6 +319,8 @@ def capture_from_arrays(
     if inside.shape != shape:
         raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
 
+    if not inside.any():
+        raise InputError("capture: the mask is empty")
     around = None if as_stored else surroundings(inside)
     sizes = int(inside.sum()), n_lights, white_level, 0 if around is None else int(around.sum())
 
@@ -361,7 +363,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
         first = stack[0].shape
         if image.shape != first:
             raise UsageError(f"found an image of shape {image.shape} at images[{index}], expected {first} as images[0]")
-        if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
+        if image.ndim not in (2, 3) or not image.size or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
         if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
             problem = f"found images of type {image.dtype}, expected uint8, uint16 or floating point"

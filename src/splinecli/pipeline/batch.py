@@ -57,7 +57,7 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
     """
     if folders and all(path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path) for path in folders):  # noqa: PTH113
         given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
-        raise UsageError(f"{given} given, expected their folder", hint=f"Pass the folder: {folders[0].parent}")
+        raise UsageError(f"{given} given, expected their folder", hint=f"Pass the folder {str(folders[0].parent)!r}")
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)
     if shard is not None:
