@@ -84,7 +84,7 @@ def main() -> None:
         seen, sharp, mask = photograph(scenes.draw_scene(generator, ENGRAVED_SHARE), generator)
         around = lens_blur.surroundings(mask)
         observations = np.concatenate((seen[:, mask].T, seen[:, around].T))
-        found = lens_blur.edge_numbers(observations, mask, around)
+        found = lens_blur.edge_numbers(observations, mask, lens_blur.pixel_rows(mask, around))
         if found is not None:
             numbers.append(found)
             sigmas.append(wanted_sigma(seen, sharp, mask))

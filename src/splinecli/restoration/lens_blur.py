@@ -70,10 +70,8 @@ def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | No
     """
     import cv2
 
-    rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
-    if not n_pixels:
-        return None
-    numbers = edge_numbers(observations, mask, around)
+    rows, n_pixels = pixel_rows(mask, around), np.count_nonzero(mask)
+    numbers = edge_numbers(observations, mask, rows)
     if numbers is None or numbers[-1] > _SMOOTHEST:
         return None
     terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
@@ -133,7 +131,7 @@ def inverse_filter(sigma: float) -> Singles:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles | None:
+def edge_numbers(observations: Singles, mask: Bools, rows: NDArray[np.int32]) -> Doubles | None:
     """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too few edges.
 
     Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
@@ -141,10 +139,11 @@ def edge_numbers(observations: Singles, mask: Bools, around: Bools) -> Doubles |
     it has 0.58. Then the correlation of the gradients of neighbouring pixels between different images, which noise does
     not change, and of gradients at a distance of two and three pixels in the same image.
 
-    See remove_blur for the arguments. The object and a narrow strip around it are analysed, in few images and, in large
-    captures, in few squares. Values above the 0.95 quantile are clipped, so that highlights do not dominate.
+    See remove_blur for the observations and the mask, and pixel_rows for the rows. The object and a narrow strip around
+    it are analysed, in few images and, in large captures, in few squares. Values above the 0.95 quantile are clipped,
+    so that highlights do not dominate.
     """
-    rows, n_pixels = _rows(mask, around), np.count_nonzero(mask)
+    n_pixels = np.count_nonzero(mask)
     chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
     level = max(float(np.quantile(chosen[:n_pixels:7], 0.95)), 1e-12)
     region = _grown(mask, _OUTLINE)
@@ -183,7 +182,7 @@ def _product(one: Singles, other: Singles) -> float:
     return float((one * other).sum(dtype=np.float64))
 
 
-def _rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
+def pixel_rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
     """Return the rows (H, W) of the observations of remove_blur, -1 if a pixel has none."""
     rows = np.full(mask.shape, -1, np.int32)
     n_pixels = np.count_nonzero(mask)
