@@ -15,16 +15,6 @@ from splinecli.output_files import MAPS
 
 DOCS = Path(__file__).resolve().parent
 PAGES = ("warnings.md", "compared_methods.md", "results.md")
-MOVED = {
-    "#one-odd-image": "input-checks.md#one-odd-image",
-    "#other-readings-of-the-images": "input-checks.md#other-interpretations-of-the-images",
-    "#shifted-images": "input-checks.md#shifted-images",
-    "#wrong-light-directions": "input-checks.md#wrong-light-directions",
-    "capture-and-calibrate.md#near-lamps": "near-lamps.md",
-    "infer.md#estimated-light-intensities": "image-preparation.md#estimated-light-intensities",
-    "measurements.md#8-bits": "robustness.md#8-bits",
-}
-"""Links in the texts of the source -> their present place."""
 
 
 def warnings_table() -> list[str]:
@@ -49,7 +39,6 @@ def maps_table() -> list[str]:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a Markdown table."""
     lines = [f"| {' | '.join(cells)} |".replace("|  |", "| |") for cells in (head, *rows)]
-    lines = [re.sub(r"(?<=\]\()[^)]+", lambda link: MOVED.get(link[0], link[0]), line) for line in lines]
     return [lines[0], "|---" * len(head) + "|", *lines[1:]]
 
 

@@ -59,7 +59,8 @@ BLACK_PIXELS = WarningKind(
 )
 CONSTANT_LIGHT = WarningKind(
     "constant_light",
-    "The images look as if they contained [ambient light](#other-readings-of-the-images) or a black level",
+    "The images look as if they contained [ambient light](input-checks.md#other-interpretations-of-the-images) or a "
+    "black level",
     "`--ambient IMAGE`, taken with all lamps off",
     severity="error",
 )
@@ -78,7 +79,7 @@ DISPLAY_ENCODED = WarningKind(
 EIGHT_BIT = WarningKind(
     "eight_bit",
     "The images have 8 bits",
-    "Export 16-bit linear images, or use RAW; [round](measurements.md#8-bits), do not cut",
+    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut",
 )
 ESTIMATED_COLOURS = WarningKind(
     "estimated_colours",
@@ -87,7 +88,7 @@ ESTIMATED_COLOURS = WarningKind(
 )
 ESTIMATED_INTENSITIES = WarningKind(
     "estimated_intensities",
-    "Light intensities were [estimated](infer.md#estimated-light-intensities)",
+    "Light intensities were [estimated](image-preparation.md#estimated-light-intensities)",
     "`--intensities FILE` if you measured them",
 )
 ESTIMATED_LIGHTS = WarningKind(
@@ -124,7 +125,7 @@ GROUND_TRUTH_Z = WarningKind(
 )
 IMAGE_INCONSISTENT = WarningKind(
     "image_inconsistent",
-    "One image [contradicts the others](#one-odd-image)",
+    "One image [contradicts the others](input-checks.md#one-odd-image)",
     "Photograph it again, or leave it out with `--light-indices`",
     severity="error",
 )
@@ -141,7 +142,7 @@ IMAGES_LEFT_OUT = WarningKind(
 )
 IMAGES_SHIFTED = WarningKind(
     "images_shifted",
-    "Images are [shifted against the others](#shifted-images)",
+    "Images are [shifted against the others](input-checks.md#shifted-images)",
     "Photograph from a tripod, or align the images first",
     severity="error",
 )
@@ -159,7 +160,7 @@ LIGHT_COLOURS = WarningKind(
 )
 LIGHT_FRAME = WarningKind(
     "light_frame",
-    "The lights are probably in [another frame](#wrong-light-directions), rotated, or half vectors",
+    "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated, or half vectors",
     "`--light-frame` or `info --mended-lights`, as the warning says",
     severity="error",
 )
@@ -181,7 +182,7 @@ LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the 
 LIGHTS_UNCHECKED = WarningKind(
     "lights_unchecked",
     "Shadows that the lights should cast are missing; with `--strict`, also where the order or the frame of the "
-    "lights [cannot be checked](#wrong-light-directions)",
+    "lights [cannot be checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
 )
 LOW_CONFIDENCE = WarningKind(
@@ -209,8 +210,8 @@ NEAR_LAMPS = WarningKind(
 )
 NEAR_LIGHTS_SUSPECTED = WarningKind(
     "near_lights_suspected",
-    "The images fit [near lamps](#other-readings-of-the-images) much better",
-    "[Say where they are](capture-and-calibrate.md#near-lamps)",
+    "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
+    "[Say where they are](near-lamps.md)",
     severity="error",
 )
 NO_MASK = WarningKind(
@@ -218,7 +219,7 @@ NO_MASK = WarningKind(
 )
 NONLINEARITY_SUSPECTED = WarningKind(
     "nonlinearity_suspected",
-    "The images [look encoded](#other-readings-of-the-images), but are read as linear",
+    "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read as linear",
     "`--transfer srgb` or `gamma:2.2`",
     severity="error",
 )
