@@ -21,7 +21,7 @@ from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.record import in_one_plane
 from splinecli.inference import estimate_normals
-from splinecli.lights.lamp_light import LightOf
+from splinecli.lights.lighting import LightingAt
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
@@ -213,10 +213,10 @@ class Recorder:
         self._refiner = refiner
         self.turns = refiner.turns
 
-    def refine(self, mask, observations, light_of: LightOf, normals, errors, *, progress=None) -> None:  # type: ignore[no-untyped-def]
-        light = light_of(np.arange(len(normals)))
+    def refine(self, mask, observations, lighting_at: LightingAt, normals, errors, *, progress=None) -> None:  # type: ignore[no-untyped-def]
+        light = lighting_at(np.arange(len(normals)))
         self.before = normals.copy(), errors.copy()
-        self._refiner.refine(mask, observations, light_of, normals, errors, progress=progress)
+        self._refiner.refine(mask, observations, lighting_at, normals, errors, progress=progress)
         self.seen = {
             "observations": light.observations, "directions": light.directions, "mask": mask,
             "normals": normals.copy(), "errors": errors.copy(),

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.confidence import capture_features
-from splinecli.lights.indirect_light import PixelPlaces
-from splinecli.lights.lamp_light import LampLight, Rows
+from splinecli.lights.lighting import PixelIndices, PixelLighting, PixelPlaces
 from splinecli.methods.estimator import CONFIDENT_DEG
 from splinecli.networks.li_ne_net import CaptureHead, error_negative_log_likelihood, probability_within
 from splinecli.networks.weights import HEAD_FORMAT, SHIPPED, manifest, serialise, tensors_sha256
@@ -60,12 +59,12 @@ def read_examples(folder: Path) -> Iterator[Example]:
         lit = np.flatnonzero(observations.max(axis=1) > 0)
         rows = rng.choice(lit, min(len(lit), PIXELS), replace=False)
 
-        def light_of(rows: Rows, seen: Floats = observations, lights: Floats = directions) -> LampLight:
-            return LampLight(seen[rows], lights if lights.ndim == 2 else lights[rows])
+        def lighting_at(rows: PixelIndices, seen: Floats = observations, lights: Floats = directions) -> PixelLighting:
+            return PixelLighting(seen[rows], lights if lights.ndim == 2 else lights[rows])
 
         for name in ("", "pixelwise_"):
             normals, errors = found[f"{name}normals"], found[f"{name}errors"]
-            features = capture_features(mask, light_of, normals, errors, found["lights"])
+            features = capture_features(mask, lighting_at, normals, errors, found["lights"])
             if features is None:
                 continue
             places = PixelPlaces(mask).places(rows)

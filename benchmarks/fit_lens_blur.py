@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
-from splinecli.maths import Bools, Singles
+from splinecli.maths import Bools, Float32Array
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import open_pixel_set
 from splinecli.restoration import lens_blur
-from splinecli.synthesis.faults import add_sensor_noise
+from splinecli.synthesis.batches import add_sensor_noise
 from splinecli.synthesis.optics import draw_optics
 from splinecli.synthesis.random_numbers import draw_number, stream_seed
 from splinecli.synthesis.whole_capture import add_background
@@ -35,7 +35,7 @@ EIGHT_BIT_SHARE = 0.3
 PENALTY = 3.0  # of the squares of the coefficients
 
 
-def photograph(scene: refinement.Scene, generator: torch.Generator) -> tuple[Singles, Singles, Bools]:
+def photograph(scene: refinement.Scene, generator: torch.Generator) -> tuple[Float32Array, Float32Array, Bools]:
     """Return images (F, H, W), 0 to 1, of a scene through a lens, the same without it, and the object's mask (H, W)."""
     maps, lights, mask = scene
     if draw_number(generator) < BACKGROUND_SHARE:
@@ -56,7 +56,7 @@ def photograph(scene: refinement.Scene, generator: torch.Generator) -> tuple[Sin
 FILTERS = [lens_blur.inverse_filter(sigma) for sigma in SIGMAS]
 
 
-def wanted_sigma(seen: Singles, sharp: Singles, mask: Bools) -> float:
+def wanted_sigma(seen: Float32Array, sharp: Float32Array, mask: Bools) -> float:
     """Return the sigma whose inverse filter brings images closest to sharp ones at the pixels of the mask."""
     off = np.zeros(len(SIGMAS))
     for image, true in zip(seen[:8], sharp[:8], strict=True):

@@ -11,25 +11,25 @@ from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.confidence import CaptureFeatures, capture_features
 from splinecli.inference import NormalEstimate, estimate_normals
-from splinecli.lights.lamp_light import LampLight
+from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
 from splinecli.networks.li_ne_net import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.networks.weights import capture_head, manifest
 
-Doubles = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 SIZE = 40
 WIDTH = float(SIZE)
 
 
-def draw_lights(count: int = 12) -> Doubles:
+def draw_lights(count: int = 12) -> Float64Array:
     rng = np.random.default_rng(1)
     return directions_at(np.arange(count) * 2.4, np.arccos(rng.uniform(0.5, 0.95, count)))
 
 
-def relief(lights: Doubles, *, widths: float | None = None) -> Capture:
+def relief(lights: Float64Array, *, widths: float | None = None) -> Capture:
     """Return a matte relief without cast shadows, under distant lights, or under lamps so many widths away."""
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, SIZE), np.linspace(0.5, -0.5, SIZE))
     heights = 0.03 * np.sin(9 * x) * np.cos(8 * y)
@@ -57,10 +57,10 @@ def features(capture: Capture) -> CaptureFeatures:
     normals = capture.ground_truth[capture.mask]
     errors = np.tile(np.float32((-3, 1)), (len(normals), 1))
 
-    def light_of(rows: NDArray[np.integer]) -> LampLight:
-        return LampLight(capture.observations[rows], capture.light_directions)
+    def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
+        return PixelLighting(capture.observations[rows], capture.light_directions)
 
-    found = capture_features(capture.mask, light_of, normals, errors, capture.light_directions)
+    found = capture_features(capture.mask, lighting_at, normals, errors, capture.light_directions)
     return found[0]
 
 

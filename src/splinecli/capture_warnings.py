@@ -7,7 +7,7 @@ docs/troubleshooting.md (docs/make_tables.py), and determine the warnings that `
 from dataclasses import dataclass
 from typing import Literal
 
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
     return [CaptureWarning(EIGHT_BIT, text)] if any_8_bit else []
 
 
-def estimated_lights(errors_deg: Doubles) -> CaptureWarning:
+def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
     """Report that the light directions were estimated from the images, with expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,

@@ -11,11 +11,10 @@ import numpy as np
 
 from splinecli.capture import Capture
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals
-from splinecli.lights.indirect_light import PixelPlaces
-from splinecli.lights.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
+from splinecli.lights.lighting import LightingAt, PixelIndices, PixelPlaces, parts_of_pixels
 from splinecli.lights.rough_normals import smooth_normals
-from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
@@ -33,7 +32,7 @@ _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
 def correct_errors(
-    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Singles, errors: Singles
+    capture: Capture, estimator: Estimator, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array
 ) -> bool:
     """Correct the distributions of errors (P, 2) in place; return whether that was possible.
 
@@ -41,7 +40,7 @@ def correct_errors(
     that is dark under every light stays as it is.
 
     Args:
-        light_of: gives the observations and the light directions of some pixels.
+        lighting_at: gives the observations and the light directions of some pixels.
         normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
     """
     import torch
@@ -51,26 +50,26 @@ def correct_errors(
     head = None if estimator.weights is None else capture_head(estimator.weights["sha256"])
     if head is None:
         return False
-    found = capture_features(capture.mask, light_of, normals, errors, capture.light_directions)
+    found = capture_features(capture.mask, lighting_at, normals, errors, capture.light_directions)
     if found is None:
         return False
     features, scale = found
     whole = torch.tensor(features, dtype=torch.float32)
     places = PixelPlaces(capture.mask)
 
-    def correct(rows: Rows) -> None:
+    def correct(rows: PixelIndices) -> None:
         brightness = capture.observations[rows].mean(axis=1)
         rows, brightness = rows[brightness > 0], brightness[brightness > 0]
         pixels = scale.features(brightness, normals[rows], *places.places(rows))
         own = torch.from_numpy(errors[rows])
         errors[rows] = head(own, torch.from_numpy(pixels.astype(np.float32)), whole).numpy()
 
-    for _ in side_by_side(correct, parts_of_rows(len(normals))):
+    for _ in side_by_side(correct, parts_of_pixels(len(normals))):
         pass
     return True
 
 
-def add_common_error(errors: Singles, error_deg: float) -> None:
+def add_common_error(errors: Float32Array, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
     Wrong lights or values rotate the normals together. The medians of both errors are added like the medians of
@@ -119,9 +118,9 @@ class PixelScale:
     bright: float  # brightness of a bright pixel
     middle: tuple[float, float]  # row and column of the middle of the object
     width: float  # of the object, in pixels
-    turning: Doubles  # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
+    turning: Float64Array  # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
 
-    def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Doubles:
+    def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Float64Array:
         """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near lamps in degrees."""
         places = self.places(rows, columns)
         turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
@@ -129,19 +128,19 @@ class PixelScale:
         turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
         return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
 
-    def places(self, rows: Integers, columns: Integers) -> Doubles:
+    def places(self, rows: Integers, columns: Integers) -> Float64Array:
         """Return places (n, 2) from the middle of the object, x right and y up, in its widths."""
         return np.stack((columns - self.middle[1], self.middle[0] - rows), axis=1) / self.width
 
 
 def capture_features(
-    mask: Bools, light_of: LightOf, normals: Singles, errors: Singles, lights: Doubles
+    mask: Bools, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array, lights: Float64Array
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
     Args:
         mask: (H, W), with P true pixels.
-        light_of: gives the observations and the light directions of some pixels.
+        lighting_at: gives the observations and the light directions of some pixels.
         normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
         lights: (F, 3), unit; of near lamps, at the origin.
     """
@@ -149,7 +148,7 @@ def capture_features(
     if n_lights < FEWEST_LIGHTS:
         return None
     rows = np.arange(0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
-    light = light_of(rows)
+    light = lighting_at(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
     kept = brightness > _DARK_SHARE * bright
@@ -170,7 +169,7 @@ def capture_features(
     best = unit(scaled)
     difference = angle_between_deg(own, best)
 
-    def explain(terms: Doubles, sign: int) -> tuple[float, float, float]:
+    def explain(terms: Float64Array, sign: int) -> tuple[float, float, float]:
         """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its rotation.
 
         An amount of the other sign is not such a fault, and does not rotate any normals.
@@ -208,11 +207,11 @@ def capture_features(
     return features, replace(scale, turning=max(near[0], 0.0) * _turning(lights))
 
 
-def _log_median(values: Doubles, least: float = _LEAST_SHARE) -> float:
+def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
     return float(np.log(np.median(values) + least))
 
 
-def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles:
+def _as_distant(values: Float64Array, directions: Floats, lights: Float64Array) -> Float64Array:
     """Return values (p, F) under directions (p, F, 3) converted for matte pixels to lights (F, 3)."""
     lit = (values > LIT_SHARE).astype(np.float64)
     scaled = fit_scaled_normals(values, lit, directions.astype(np.float64))
@@ -220,7 +219,9 @@ def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles
     return np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
 
 
-def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Doubles) -> Doubles:
+def _residuals_under(
+    normals: Float64Array, values: Float64Array, lit: Float64Array, lights: Float64Array
+) -> Float64Array:
     """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and any albedo."""
     cosines = (normals @ lights.T).clip(min=0)
     seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain
@@ -232,7 +233,7 @@ def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Do
     return np.asarray(left)
 
 
-def _turning(lights: Doubles) -> Doubles:
+def _turning(lights: Float64Array) -> Float64Array:
     """Return by how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)."""
     solve = np.linalg.pinv(lights)
     turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
@@ -241,7 +242,7 @@ def _turning(lights: Doubles) -> Doubles:
     return np.asarray(turning)
 
 
-def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, float]:
+def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, float, float, float]:
     """Return rank_residual, light_misfit, free_light_misfit and decoding; see CaptureFeatures."""
     few = values[:: max(1, len(values) // max(1000, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
     factors = find_factors(few)
@@ -263,7 +264,7 @@ def _of_shape(mask: Bools, places: PixelPlaces, normals: Floats) -> tuple[float,
     if min(blocks.mask.shape) < 2:
         return np.nan, np.nan
     sums = np.zeros((3, np.count_nonzero(blocks.mask)))
-    for rows in parts_of_rows(len(normals)):
+    for rows in parts_of_pixels(len(normals)):
         number = blocks.numbers_at(*places.places(rows))
         for total, column in zip(sums, normals[rows].T, strict=True):
             total += np.bincount(number, column, len(total))

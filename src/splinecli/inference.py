@@ -24,8 +24,17 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
-from splinecli.lights.indirect_light import IndirectLight, PixelPlaces, find_indirect_light
-from splinecli.lights.lamp_light import LampLight, LightOf, Rows, flat_depth, parts_of_rows, surface_points
+from splinecli.lights.lighting import (
+    IndirectLight,
+    LightingAt,
+    PixelIndices,
+    PixelLighting,
+    PixelPlaces,
+    find_indirect_light,
+    flat_depth,
+    parts_of_pixels,
+    surface_points,
+)
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator, make_estimator
 from splinecli.methods.estimator import TILE_PIXELS, confidence
@@ -53,7 +62,7 @@ def find_surface(capture: Capture) -> Capture:
     # enough.
     for _ in range(2):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
-        light = LampLight.of(observations, replace(lamps, points=points))
+        light = PixelLighting.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
         normal_map = np.zeros((*blocks.mask.shape, 3))
         normal_map[blocks.mask] = normals
@@ -148,14 +157,14 @@ def _estimate(
     Methods without confidence have no distributions.
     """
     found = estimate_pixels(
-        capture.mask, capture.observations, light_on(capture), estimator, tile_pixels, progress, stage
+        capture.mask, capture.observations, lighting_on(capture), estimator, tile_pixels, progress, stage
     )
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner
     if refiner is not None and errors is not None:
         with (stage or _no_stage)("refining") as advance:
-            refiner.refine(capture.mask, capture.observations, found.light_of, normals, errors, progress=advance)
-    judged = errors is not None and correct_errors(capture, estimator, found.light_of, normals, errors)
+            refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
+    judged = errors is not None and correct_errors(capture, estimator, found.lighting_at, normals, errors)
     if errors is not None:
         found_lights = [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
         for error_deg in (*found_lights, *(warning.error_deg for warning in capture.warnings)):
@@ -169,18 +178,18 @@ class PixelEstimates(NamedTuple):
 
     normals: (P, 3) float32, unit, in the capture's frame.
     errors: (P, 2) float32, the distributions of their errors; None for methods without confidence.
-    light_of: the light of the pixels as used for the last estimate: without indirect light where that was removed.
+    lighting_at: the light of the pixels as used for the last estimate: without indirect light where that was removed.
     """
 
     normals: NDArray[np.float32]
     errors: NDArray[np.float32] | None
-    light_of: LightOf
+    lighting_at: LightingAt
 
 
 def estimate_pixels(
     mask: NDArray[np.bool_],
     observations: NDArray[np.float32],
-    light_without: Callable[[IndirectLight | None, Rows], LampLight],
+    lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
     tile_pixels: int | None = None,
     progress: Progress | None = None,
@@ -193,7 +202,7 @@ def estimate_pixels(
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
-        light_without: gives the light of some pixels without the given indirect light; None removes nothing.
+        lighting_without: gives the light of some pixels without the given indirect light; None removes nothing.
         tile_pixels, progress, stage: see estimate_normals.
     """
     tile_pixels = tile_pixels or estimator.tile_pixels
@@ -201,53 +210,53 @@ def estimate_pixels(
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
-    def estimate(pixels: Rows, light: LampLight, progress: Progress | None = None) -> None:
+    def estimate(pixels: PixelIndices, light: PixelLighting, progress: Progress | None = None) -> None:
         found, of_pixels = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
         if errors is not None:
             errors[pixels] = of_pixels
         normals[pixels] = light.in_frame_of_capture(found)
 
-    light_of = partial(light_without, None)
+    lighting_at = partial(lighting_without, None)
     refiner = estimator.refiner
-    estimator = estimator.bind(light_of, n_pixels)
-    for pixels in parts_of_rows(n_pixels, tile_pixels):
-        estimate(pixels, light_of(pixels), progress)
+    estimator = estimator.bind(lighting_at, n_pixels)
+    for pixels in parts_of_pixels(n_pixels, tile_pixels):
+        estimate(pixels, lighting_at(pixels), progress)
     if refiner is None or errors is None:
-        return PixelEstimates(normals, errors, light_of)
+        return PixelEstimates(normals, errors, lighting_at)
     with (stage or _no_stage)("removing indirect light") as advance:
-        indirect = find_indirect_light(mask, observations, light_of, normals)
+        indirect = find_indirect_light(mask, observations, lighting_at, normals)
         if indirect is not None:
-            light_of = partial(light_without, indirect)
+            lighting_at = partial(lighting_without, indirect)
             # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
-            estimator = estimator.rebind(light_of, n_pixels)
-            for pixels in parts_of_rows(n_pixels, tile_pixels):
+            estimator = estimator.rebind(lighting_at, n_pixels)
+            for pixels in parts_of_pixels(n_pixels, tile_pixels):
                 changed = pixels[indirect.counts_at(observations[pixels], pixels)]
                 if len(changed):
-                    estimate(changed, light_of(changed))
+                    estimate(changed, lighting_at(changed))
                 advance(len(pixels))
-    return PixelEstimates(normals, errors, light_of)
+    return PixelEstimates(normals, errors, lighting_at)
 
 
 def _no_stage(_: str) -> AbstractContextManager[Progress]:
     return nullcontext(lambda _: None)
 
 
-def light_on(capture: Capture) -> Callable[[IndirectLight | None, Rows], LampLight]:
-    """Return a function for the light of some of a capture's pixels: see `light_without` of estimate_pixels."""
+def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndices], PixelLighting]:
+    """Return a function for the light of some of a capture's pixels: see `lighting_without` of estimate_pixels."""
     lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
     places = PixelPlaces(capture.mask)
 
-    def light_without(indirect: IndirectLight | None, pixels: Rows) -> LampLight:
+    def lighting_without(indirect: IndirectLight | None, pixels: PixelIndices) -> PixelLighting:
         observations = capture.observations[pixels]
         if indirect is not None:
             observations = indirect.remove(observations, pixels)
         if lamps is not None:
-            return LampLight.of(observations, lamps.choose_pixels(pixels))
+            return PixelLighting.of(observations, lamps.choose_pixels(pixels))
         if camera_matrix is None:
-            return LampLight(observations, directions)
-        return LampLight.distant(observations, directions, rays_at(*places.places(pixels), camera_matrix))
+            return PixelLighting(observations, directions)
+        return PixelLighting.distant(observations, directions, rays_at(*places.places(pixels), camera_matrix))
 
-    return light_without
+    return lighting_without
 
 
 def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:

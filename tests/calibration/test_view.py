@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from splinecli.calibration.balls import DISTANT, find_view
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 
 
 def photograph(path: Path, tags: dict[int, object]) -> Path:
@@ -31,7 +31,7 @@ def photograph(path: Path, tags: dict[int, object]) -> Path:
     ],
 )
 def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) -> None:
-    view = find_view(read_facts(photograph(tmp_path / "a.jpg", tags)), None)
+    view = find_view(read_header(photograph(tmp_path / "a.jpg", tags)), None)
     assert view.source == ("assumed distant" if focal == DISTANT else "EXIF")
     np.testing.assert_allclose(view.matrix, ((focal, 0, 179.5), (0, focal, 119.5), (0, 0, 1)), rtol=1e-6)
 
@@ -39,4 +39,4 @@ def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) ->
 def test_a_file_comes_first(tmp_path: Path) -> None:
     image = photograph(tmp_path / "a.jpg", {0xA405: 50})
     (tmp_path / "m.txt").write_text("700 0 180\n0 710 120\n0 0 1\n")
-    assert find_view(read_facts(image), tmp_path / "m.txt").matrix[1, 1] == 710
+    assert find_view(read_header(image), tmp_path / "m.txt").matrix[1, 1] == 710

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scenes import with_chunk, write_capture
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.linearise import linear_light
 from splinecli.errors import InputError
 
@@ -126,7 +126,7 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     ):
         path = tmp_path / name
         path.write_bytes(content)
-        assert (read_facts(path).curve.curve is None) == encoded, name
+        assert (read_header(path).curve.curve is None) == encoded, name
     folder = store(tmp_path / "capture", light)
     assert "display_encoded" not in codes(read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))

@@ -11,8 +11,8 @@ import pytest
 from splinecli.capture import open_capture
 from splinecli.capture.linearise import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.inference import light_on
-from splinecli.lights.lamp_light import LampLight, flat_depth, surface_points
+from splinecli.inference import lighting_on
+from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import describe_capture
@@ -116,7 +116,7 @@ def test_near_lamps_light_a_part_as_they_light_the_whole(crop, scale, perspectiv
         capture = record.open(MEDALLION).read(as_stored=True)
         places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
         points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
-        lit = LampLight.of(capture.observations, replace(capture.lamps, points=points))
+        lit = PixelLighting.of(capture.observations, replace(capture.lamps, points=points))
         values = np.concatenate((lit.directions.reshape(len(points), -1), lit.observations), axis=1)
         image = np.zeros((*capture.mask.shape, values.shape[1]))
         image[capture.mask] = values
@@ -133,7 +133,7 @@ def test_a_near_camera_sees_a_part_as_it_sees_the_whole(crop, scale, tmp_path):
     for options in ((None, None), (crop, scale)):
         record = InferOptions(crop=options[0], scale=options[1], camera_matrix=str(matrix))
         capture = record.open(MEDALLION).read(as_stored=True)
-        directions = light_on(capture)(None, np.arange(capture.n_pixels)).directions
+        directions = lighting_on(capture)(None, np.arange(capture.n_pixels)).directions
         image = np.zeros((*capture.mask.shape, *directions.shape[1:]))
         image[capture.mask] = directions
         images.append(image)

@@ -18,8 +18,7 @@ from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.inference import estimate_normals
-from splinecli.lights.indirect_light import IndirectLight, find_indirect_light
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.lights.lighting import IndirectLight, LightingAt, PixelLighting, find_indirect_light
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.batched import NetworkEstimator
@@ -68,7 +67,7 @@ def found_in(
     normals: NDArray[np.floating], observations: Floats, lights: NDArray[np.floating] = LIGHTS
 ) -> IndirectLight | None:
     return find_indirect_light(
-        MASK, observations, lambda rows: LampLight(observations[rows], lights), normals.astype(np.float32)
+        MASK, observations, lambda rows: PixelLighting(observations[rows], lights), normals.astype(np.float32)
     )
 
 
@@ -92,10 +91,10 @@ def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None
     direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
     seen = direct + indirect
 
-    def light_of(rows: NDArray[np.integer]) -> LampLight:
-        return LampLight.of(seen[rows], lamps.choose_pixels(rows))
+    def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
+        return PixelLighting.of(seen[rows], lamps.choose_pixels(rows))
 
-    found = find_indirect_light(MASK, seen, light_of, BOWL.astype(np.float32))
+    found = find_indirect_light(MASK, seen, lighting_at, BOWL.astype(np.float32))
     assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
 
@@ -108,7 +107,7 @@ def test_a_dark_background_changes_nothing() -> None:
     place[320:384, 320:384] = MASK
     normals[place], observations[place] = BOWL, DIRECT + INDIRECT
     normals, observations = normals[mask], observations[mask]
-    found = find_indirect_light(mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals)
+    found = find_indirect_light(mask, observations, lambda rows: PixelLighting(observations[rows], LIGHTS), normals)
     ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
     assert ratio[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
@@ -166,8 +165,10 @@ def test_the_refinement_sees_what_is_left() -> None:
 
         return nullcontext(count)
 
-    def refine(_: NetworkRefiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object) -> None:
-        seen.append(light_of(EVERYWHERE).observations)
+    def refine(
+        _: NetworkRefiner, __: object, ___: object, lighting_at: LightingAt, *____: object, **_____: object
+    ) -> None:
+        seen.append(lighting_at(EVERYWHERE).observations)
 
     seen: list[Floats] = []
     with patch.object(NetworkRefiner, "refine", refine):
@@ -179,9 +180,9 @@ def test_the_refinement_sees_what_is_left() -> None:
 def test_the_capture_is_seen_anew_without_its_own_light() -> None:
     seen, look = [], NetworkEstimator.bind
 
-    def bind(estimator: NetworkEstimator, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
-        seen.append(light_of(EVERYWHERE).observations)
-        return look(estimator, light_of, n_pixels)
+    def bind(estimator: NetworkEstimator, lighting_at: LightingAt, n_pixels: int) -> NetworkEstimator:
+        seen.append(lighting_at(EVERYWHERE).observations)
+        return look(estimator, lighting_at, n_pixels)
 
     with patch.object(NetworkEstimator, "bind", bind):
         estimate_normals(CAPTURE, make_estimator("spline-net"))

@@ -16,7 +16,7 @@ from PIL import Image, ImageCms
 
 from scenes import with_chunk
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.formats.facts import StatedCurve, read_facts
+from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.maths.transfer import TransferCurve, decode_transfer, profile_curve
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -121,18 +121,18 @@ def test_profiles_without_a_usable_curve(icc: bytes) -> None:
 def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
-    assert read_facts(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
-    assert read_facts(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(1.0, by)
-    stated = read_facts(write(path, b"no profile")).curve
+    assert read_header(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
+    assert read_header(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(1.0, by)
+    stated = read_header(write(path, b"no profile")).curve
     assert stated.unread and stated.curve == (None if suffix == ".jpg" else 1.0)
-    assert not read_facts(write(path, None)).curve.unread
+    assert not read_header(write(path, None)).curve.unread
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
 def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
     path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
     tracemalloc.start()
-    assert read_facts(path).curve.unread
+    assert read_header(path).curve.unread
     assert tracemalloc.get_traced_memory()[1] < 20e6
     tracemalloc.stop()
 
@@ -140,7 +140,7 @@ def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
 def test_many_parts_in_a_jpeg(tmp_path: Path) -> None:
     part = b"\xff\xe2" + struct.pack(">H", 65_535) + b"ICC_PROFILE\0\1\1"
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + (part + bytes(65_535 - 16)) * 100)
-    assert read_facts(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
+    assert read_header(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
 
 
 def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) -> Path:

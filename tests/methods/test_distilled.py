@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import (
@@ -68,8 +68,8 @@ def glossy(count: int = 8000) -> tuple[Floats, NDArray[np.float32]]:
     return normals, shade(normals, LIGHTS, gloss=0.8).astype(np.float32)
 
 
-def distant(observations: NDArray[np.float32]) -> LightOf:
-    return lambda rows: LampLight(observations[rows], LIGHTS)
+def distant(observations: NDArray[np.float32]) -> LightingAt:
+    return lambda rows: PixelLighting(observations[rows], LIGHTS)
 
 
 def learn(teacher: Remembering, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
@@ -124,7 +124,7 @@ def test_lamps_near_a_plane_of_bumps() -> None:
     shading = np.einsum("pfc,pc->pf", directions, normals).clip(0)
     observations = (shading + 0.3 * shading**8).astype(np.float32)
     teacher = sure(observations, noisy(normals, 4), 4)
-    found = distil(teacher, lambda rows: LampLight(observations[rows], directions[rows]), 8000, SIZE)
+    found = distil(teacher, lambda rows: PixelLighting(observations[rows], directions[rows]), 8000, SIZE)
     assert angle_between_deg(found.estimate(observations, directions), normals).mean() < 4 / 2
     assert angle_between_deg(LeastSquares().estimate(observations, directions), normals).mean() > 4
     far = learn(teacher)

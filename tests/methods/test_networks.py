@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
 from splinecli.methods.batched import NetworkEstimator, rotations_of
@@ -86,14 +86,14 @@ def test_networks_in_several_threads_count_apart() -> None:
     assert done[0] == done[1] == done[2]
 
 
-def light_of(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightOf:
-    return lambda rows: LampLight(observations[rows], lights)
+def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightingAt:
+    return lambda rows: PixelLighting(observations[rows], lights)
 
 
 def test_pixels_see_their_capture_and_not_their_tile() -> None:
     observations, lights = pixels(600)
     network = estimator(random_network(**SEES), batch_size=100)
-    whole = network.bind(light_of(observations, lights), 600)
+    whole = network.bind(lighting_at(observations, lights), 600)
     expected, errors = whole.estimate_with_error(observations, lights)
     for tile in (slice(0, 30), slice(250, 600)):
         found, found_errors = whole.estimate_with_error(observations[tile], lights)
@@ -112,7 +112,7 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     expected = network.estimate(observations, lights)
     dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
     with_background = np.concatenate((dark[:400], observations, dark[400:]))
-    found = network.bind(light_of(with_background, lights), 1000).estimate(with_background, lights)
+    found = network.bind(lighting_at(with_background, lights), 1000).estimate(with_background, lights)
     assert angle_between_deg(found[400:600], expected).max() < 0.01
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
@@ -120,4 +120,4 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
 def test_methods_that_see_no_capture_stay_as_they_are() -> None:
     observations, lights = pixels(20)
     for method in (estimator(), make_estimator("ls")):
-        assert method.bind(light_of(observations, lights), 20) is method
+        assert method.bind(lighting_at(observations, lights), 20) is method

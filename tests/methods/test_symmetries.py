@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.lights.lamp_light import LampLight
+from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import Estimator, MethodOptions, make_estimator, method_names
 
@@ -67,7 +67,7 @@ def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) ->
     _, lights, observations = glossy_pixels
     some = observations[:6].astype(np.float32)
     turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
-    method = make(name).bind(lambda rows: LampLight(some[rows], turned[rows]), len(some))
+    method = make(name).bind(lambda rows: PixelLighting(some[rows], turned[rows]), len(some))
     together = method.estimate(some, turned)
     pairs = [method.estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
     assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05

@@ -20,7 +20,7 @@ from splinecli.errors import InputError, ModelError, OutputError, SplinecliError
 from splinecli.maths.normals import unit
 from splinecli.pipeline import batch
 from splinecli.pipeline import distribution as distribution_module
-from splinecli.pipeline.batch import Member, choose_workers, expected_bytes, infer_batch, list_captures
+from splinecli.pipeline.batch import BatchItem, choose_workers, expected_bytes, infer_batch, list_captures
 from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
 from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
@@ -236,7 +236,7 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
 
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
-    member = Member(tmp_path / "unseen", "unseen")
+    member = BatchItem(tmp_path / "unseen", "unseen")
     outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3

@@ -13,7 +13,7 @@ from splinecli.capture import Capture, read_capture
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trials import scored_rows
 from splinecli.inference import estimate_normals
-from splinecli.lights.lamp_light import LampLight, LightOf
+from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import unit
 from splinecli.methods.batched import NetworkEstimator
 from splinecli.methods.estimator import UNKNOWN_ERROR
@@ -39,8 +39,8 @@ def lively(network: Network) -> Network:
     return network.eval()
 
 
-def distant(observations: NDArray[np.float32], lights: NDArray[np.float64] = LIGHTS) -> LightOf:
-    return lambda rows: LampLight(observations[rows], lights)
+def distant(observations: NDArray[np.float32], lights: NDArray[np.float64] = LIGHTS) -> LightingAt:
+    return lambda rows: PixelLighting(observations[rows], lights)
 
 
 def refine(
@@ -120,12 +120,12 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
     asked: list[int] = []
 
     def refined(turned: bool) -> NDArray[np.float32]:
-        def light_of(rows: NDArray[np.integer]) -> LampLight:
+        def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
             asked.append(len(rows))
-            return LampLight(observations[rows], LIGHTS, turns[rows] if turned else None)
+            return PixelLighting(observations[rows], LIGHTS, turns[rows] if turned else None)
 
         found, errors = normals.copy(), np.tile(np.float32((-3, 1)), (900, 1))
-        NetworkRefiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, light_of, found, errors)
+        NetworkRefiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, lighting_at, found, errors)
         return found
 
     at_once = refined(True)

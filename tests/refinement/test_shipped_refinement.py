@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scenes import directions_at, halfway
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
-from splinecli.lights.lamp_light import LampLight
+from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.refinement.refiner import MARGIN, TILE, NetworkRefiner
@@ -143,13 +143,13 @@ def test_seams_of_tiles_do_not_show() -> None:
     network = make_estimator("spline-net", MethodOptions(precision="float32")).refiner.network
     found = []
 
-    def light_of(chosen: Any) -> LampLight:
-        return LampLight(capture.observations[chosen], LIGHTS)
+    def lighting_at(chosen: Any) -> PixelLighting:
+        return PixelLighting(capture.observations[chosen], LIGHTS)
 
     for tile in (TILE, MARGIN):
         refiner = NetworkRefiner(network, "float32", turns=1, tile=tile)
         normals, errors = before.copy(), errors_before.copy()
-        refiner.refine(capture.mask, capture.observations, light_of, normals, errors)
+        refiner.refine(capture.mask, capture.observations, lighting_at, normals, errors)
         found.append((normals, errors))
     assert angle_between_deg(found[0][0], before).mean() > 0.2
     assert angle_between_deg(found[0][0], found[1][0]).max() < 0.006  # 1e-4 radians

@@ -70,8 +70,8 @@ def test_flat_objects(widths, tilt):
     vectors = np.broadcast_to(directions, (size**2, 8, 3))
     if widths is not None:
         lamps = NearLamps.of(directions * widths * size, 1.0, (size, size), equal=True)
-        towards, strengths = lamps.light_at(lamps.plane_points(*np.divmod(np.arange(size**2), size)))
-        vectors = towards * strengths[..., None]
+        towards, attenuation = lamps.light_at(lamps.plane_points(*np.divmod(np.arange(size**2), size)))
+        vectors = towards * attenuation[..., None]
     shaded = np.einsum("pfc,pc->pf", vectors, normals) * rng.uniform(0.3, 1, (size**2, 1))
     observations = (shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape)).astype(np.float32)
     found = estimate_light_intensities(observations, None, lambda rows: vectors[rows])

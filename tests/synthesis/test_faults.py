@@ -11,7 +11,7 @@ from torch import Tensor
 from distributions import SHARE, N, assert_uniform, generator
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.transfer import decode_transfer
-from splinecli.synthesis.faults import (
+from splinecli.synthesis.batches import (
     BITS,
     add_sensor_noise,
     disturb_light_directions,

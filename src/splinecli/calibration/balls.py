@@ -26,12 +26,12 @@ from splinecli.capture.files import (
     is_mask_name,
     list_images,
 )
-from splinecli.capture.formats.facts import ImageFacts, read_facts
+from splinecli.capture.formats.facts import ImageHeader, read_header
 from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.capture.source import Progress
 from splinecli.errors import InputError
-from splinecli.maths import Array, Doubles, Singles
+from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 
@@ -50,7 +50,7 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 class View:
     """The camera of a calibration."""
 
-    matrix: Doubles  # (3, 3) in pixels
+    matrix: Float64Array  # (3, 3) in pixels
     source: str  # "--camera-matrix", "EXIF" or "assumed distant"
     shortest: float  # the focal length of the shortest usual lens, in pixels
 
@@ -58,7 +58,7 @@ class View:
     def known(self) -> bool:
         return self.source != "assumed distant"
 
-    def draw(self, generator: np.random.Generator) -> Doubles:
+    def draw(self, generator: np.random.Generator) -> Float64Array:
         """Return a matrix (3, 3) that may be the true one."""
         factor = 1.0
         if not self.known:
@@ -73,12 +73,12 @@ class View:
         return matrix
 
 
-def unit_rays(points: Doubles, matrix: Doubles) -> Doubles:
+def unit_rays(points: Float64Array, matrix: Float64Array) -> Float64Array:
     """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
     return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
 
 
-def find_view(image: ImageFacts, matrix: Path | None) -> View:
+def find_view(image: ImageHeader, matrix: Path | None) -> View:
     """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
 
     Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
@@ -155,7 +155,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
 
 
-def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
+def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
     """Return the centre (3,) of a ball whose outline is at these image points (N, 2) of a camera.
 
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
@@ -174,7 +174,7 @@ def ball_centre(outline: Doubles, matrix: Doubles) -> Doubles:
     return np.asarray(np.array((mx, my, -1 - beyond)) / np.sqrt(max(inverse, 1e-30)))
 
 
-def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doubles, Doubles]:
+def reflect(centre: Float64Array, highlights: Float64Array, matrix: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
@@ -183,7 +183,7 @@ def reflect(centre: Doubles, highlights: Doubles, matrix: Doubles) -> tuple[Doub
     return normals, rays - 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
 
 
-def check_in_front(direction: Doubles, ray: Doubles) -> None:
+def check_in_front(direction: Float64Array, ray: Float64Array) -> None:
     """Raise InputError if a light direction (3,) is level with the ball or behind it, as viewed from the camera."""
     if not direction @ ray < 0:
         problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
@@ -206,9 +206,9 @@ class BallFiles:
     mask: Path | None
 
     @cached_property
-    def facts(self) -> tuple[ImageFacts, ...]:
+    def facts(self) -> tuple[ImageHeader, ...]:
         """Facts from the headers of the images."""
-        return tuple(map(read_facts, self.images))
+        return tuple(map(read_header, self.images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,13 +219,13 @@ class BallCalibration:
     circle: Circle
     circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
     highlights: tuple[Highlight, ...]  # (F,), one for each image
-    directions: Doubles  # (F, 3) float64, unit vectors; x right, y up, z to the camera
-    normals: Doubles  # (F, 3), of the ball at the highlights, half-way between the view and the lights
+    directions: Float64Array  # (F, 3) float64, unit vectors; x right, y up, z to the camera
+    normals: Float64Array  # (F, 3), of the ball at the highlights, half-way between the view and the lights
     view: View
     shape: tuple[int, ...]  # (H, W) of the images
 
     @property
-    def points(self) -> Doubles:
+    def points(self) -> Float64Array:
         """The highlights (F, 2) in the image."""
         return np.array([(highlight.x, highlight.y) for highlight in self.highlights])
 
@@ -235,8 +235,8 @@ class CalibratedLights:
     """The light directions from one or several balls."""
 
     balls: tuple[BallCalibration, ...]
-    directions: Doubles  # (F, 3) float64, unit vectors: the mean direction of the balls
-    disagreement_deg: Doubles  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
+    directions: Float64Array  # (F, 3) float64, unit vectors: the mean direction of the balls
+    disagreement_deg: Float64Array  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
@@ -334,8 +334,8 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     return circle, source
 
 
-def _mean_gray(images: Sequence[Path]) -> Singles:
-    total: Singles = read_image(images[0]).mean(axis=2)
+def _mean_gray(images: Sequence[Path]) -> Float32Array:
+    total: Float32Array = read_image(images[0]).mean(axis=2)
     expected = ExpectedSize(total.shape, images[0].name)
     for path in images[1:]:
         total = total + read_image(path, expected).mean(axis=2)

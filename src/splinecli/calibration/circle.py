@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from splinecli.errors import InputError
-from splinecli.maths import Array, Bools, Doubles, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
 
 RAYS = 720
@@ -30,16 +30,16 @@ class Circle:
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
     visible: float = 1.0  # share of the outline that the image or mask shows, 0 to 1
-    points: Doubles | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
+    points: Float64Array | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
 
     @property
-    def outline(self) -> Doubles:
+    def outline(self) -> Float64Array:
         """The points (N, 2) of the outline near the circle. A near camera shows an ellipse instead of a circle."""
         if self.points is not None:
             return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
         return (self.x, self.y) + self.radius * _RAYS
 
-    def normals(self, x: Doubles, y: Doubles) -> Doubles:
+    def normals(self, x: Float64Array, y: Float64Array) -> Float64Array:
         """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
@@ -126,7 +126,7 @@ def _merit(circle: Circle) -> float:
     return circle.visible * math.sqrt(circle.radius)
 
 
-def _refine(values: Singles, guess: Circle) -> Circle | None:
+def _refine(values: Float32Array, guess: Circle) -> Circle | None:
     """Return the circle through the strongest edges along rays from the guess's centre; None if too few agree."""
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
@@ -152,7 +152,7 @@ def _refine(values: Singles, guess: Circle) -> Circle | None:
     return guess
 
 
-def _fit(points: Doubles, *, outline_points: int) -> Circle:
+def _fit(points: Float64Array, *, outline_points: int) -> Circle:
     """Return the circle through most of the points (N, 2); a complete outline would have `outline_points`.
 
     RANSAC with samples of three points, then least squares over the points close to the circle.
@@ -186,7 +186,7 @@ def _fit(points: Doubles, *, outline_points: int) -> Circle:
     return Circle(x, y, radius, spread, min(1.0, float(close.sum() / outline_points)))
 
 
-def _through(three: Doubles) -> tuple[float, float, float] | None:
+def _through(three: Float64Array) -> tuple[float, float, float] | None:
     """Return x, y and radius of the circle through three points (3, 2), or None if they are collinear."""
     (ax, ay), (bx, by), (cx, cy) = three
     twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
@@ -197,6 +197,6 @@ def _through(three: Doubles) -> tuple[float, float, float] | None:
     return ax + x, ay + y, math.hypot(x, y)
 
 
-def _distance(points: Doubles, circle: tuple[float, float, float]) -> Doubles:
+def _distance(points: Float64Array, circle: tuple[float, float, float]) -> Float64Array:
     x, y, radius = circle
     return np.asarray(np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius))

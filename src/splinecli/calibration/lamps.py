@@ -20,7 +20,7 @@ from splinecli.capture.formats.images import ExpectedSize, common_size, read_mas
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
-from splinecli.maths import Bools, Doubles
+from splinecli.maths import Bools, Float64Array
 from splinecli.maths.normals import angle_between_deg
 from splinecli.restoration.images import Saturation
 from splinecli.surface.pixel_grid import focal_length, ray_basis
@@ -34,8 +34,8 @@ _MIN_PIXELS, _MOST_PIXELS = 50, 1 << 16
 
 
 def measure_light_intensities(
-    files: BallFiles, light_directions: Doubles, target: Target, *, radiometry: RadiometricCalibration = AS_STORED
-) -> Doubles:
+    files: BallFiles, light_directions: Float64Array, target: Target, *, radiometry: RadiometricCalibration = AS_STORED
+) -> Float64Array:
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
     By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
@@ -88,7 +88,7 @@ def measure_light_intensities(
     return np.asarray(intensities / intensities.mean())
 
 
-def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Doubles]:
+def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Float64Array]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
     mask = np.ones(shape, np.bool_)
     if files.mask is not None:
@@ -117,8 +117,8 @@ CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 class LampPositions:
     """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
 
-    positions: Doubles  # (F, 3)
-    uncertainty: Doubles  # (F,), the distance within which the true position is with CONFIDENCE
+    positions: Float64Array  # (F, 3)
+    uncertainty: Float64Array  # (F,), the distance within which the true position is with CONFIDENCE
     pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
     view: View
 
@@ -158,14 +158,17 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
 
 
 def _positions(
-    balls: Sequence[BallCalibration], matrix: Doubles, diameter: float | None, errors: np.random.Generator | None = None
-) -> tuple[Doubles, float, float]:
+    balls: Sequence[BallCalibration],
+    matrix: Float64Array,
+    diameter: float | None,
+    errors: np.random.Generator | None = None,
+) -> tuple[Float64Array, float, float]:
     """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
 
     `errors` draws errors of the pixels; None takes them as they are.
     """
 
-    def error(*shape: int) -> Doubles:
+    def error(*shape: int) -> Float64Array:
         return np.zeros(shape) if errors is None else errors.normal(size=shape)
 
     centres = np.array([ball_centre(ball.circle.outline + PIXEL_ERROR * error(2), matrix) for ball in balls])
@@ -189,7 +192,7 @@ def _positions(
     return points * unit, pixel * unit, miss
 
 
-def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float]:
+def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Float64Array, float]:
     """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays miss them.
 
     The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN gives NaN.
@@ -214,8 +217,8 @@ def intersect_rays(starts: Doubles, directions: Doubles) -> tuple[Doubles, float
 
 def calibration_report(
     lights: CalibratedLights,
-    intensities: Doubles | None,
-    known_directions: Doubles | None,
+    intensities: Float64Array | None,
+    known_directions: Float64Array | None,
     *,
     picture: str,
     lamps: LampPositions | None = None,
@@ -293,7 +296,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lamps: LampPositions | None) -> list[str]:
+def _warnings(
+    lights: CalibratedLights, known: Float64Array | None, picture: str, lamps: LampPositions | None
+) -> list[str]:
     warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain ({100 * ball.circle.visible:.0f} % of it visible,"
         f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
@@ -330,11 +335,11 @@ def _warnings(lights: CalibratedLights, known: Doubles | None, picture: str, lam
     return warnings
 
 
-def _mean_and_largest(angles_deg: Doubles, unit: str = "") -> dict[str, float]:
+def _mean_and_largest(angles_deg: Float64Array, unit: str = "") -> dict[str, float]:
     return {f"mean{unit}": _round(angles_deg.mean()), f"largest{unit}": _round(angles_deg.max())}
 
 
-def _rows(values: Doubles) -> list[list[float]]:
+def _rows(values: Float64Array) -> list[list[float]]:
     return [[_round(value, 6) for value in row] for row in values]
 
 

@@ -15,15 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture.formats.decoders import RAW_SUFFIXES, page_of, pages
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
 from splinecli.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
 from splinecli.output_files import FOUND_LIGHTS, PLOTS, own_files
-from splinecli.output_files import MAPS as MAPS
-from splinecli.output_files import NORMALS as NORMALS
-from splinecli.output_files import SCALED_MAPS as SCALED_MAPS
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
@@ -259,9 +256,9 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
         entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
     named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
     try:
-        size = read_facts(images[0]).size[0] if named else ()
-        masks = [path for path in named if read_facts(path).size[0][:2] == size[:2]]
-        if not named and read_facts(images[0]).stated_channels in (2, 4):
+        size = read_header(images[0]).size[0] if named else ()
+        masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
+        if not named and read_header(images[0]).stated_channels in (2, 4):
             masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
     except InputError:  # reading the images reports the damage
         return None, ()

@@ -38,7 +38,7 @@ from splinecli.capture.light_rows import (
     refuse_angles,
 )
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 from splinecli.maths.normals import unit
 from splinecli.system.files import StrPath, is_found_file
 
@@ -50,17 +50,17 @@ def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
 
 
-def _encode_text(directions: Doubles, images: Sequence[Path]) -> bytes:
+def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
     return rows_text(directions).encode()
 
 
-def _encode_lp(directions: Doubles, images: Sequence[Path]) -> bytes:
+def _encode_lp(directions: Float64Array, images: Sequence[Path]) -> bytes:
     rows = zip(images, rows_text(directions).splitlines(), strict=True)
     text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
     return text.encode(errors="surrogateescape")
 
 
-def _encode_npy(directions: Doubles, images: Sequence[Path]) -> bytes:
+def _encode_npy(directions: Float64Array, images: Sequence[Path]) -> bytes:
     np.save(file := io.BytesIO(), directions)
     return file.getvalue()
 
@@ -75,7 +75,9 @@ class LightFormat:
     found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
     rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
     recognise: Callable[[Path], bool] = Path.exists  # decides by content between formats with one suffix
-    encode: Callable[[Doubles, Sequence[Path]], bytes] | None = None  # directions (F, 3) of images; None if only read
+    encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = (
+        None  # directions (F, 3) of images; None if only read
+    )
 
 
 FORMATS = (
@@ -155,7 +157,7 @@ _STRONGEST = 1e12  # largest intensity; it and its inverse are within float32's 
 
 def read_light_directions(
     path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
-) -> Doubles:
+) -> Float64Array:
     """Return unit light directions (F, 3) float64 from a light file, in the order of the file.
 
     A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the columns in another
@@ -180,7 +182,7 @@ def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberR
     return format_of(path).read(path, n_images, form)
 
 
-def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Doubles:
+def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Float64Array:
     """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
 
     Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
@@ -197,7 +199,7 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
 
 def lights_of(
     table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm, *, leave_bad: bool = False
-) -> tuple[Doubles, Doubles]:
+) -> tuple[Float64Array, Float64Array]:
     """Return vectors (F, 3) of any length in the usual frame, and the same at unit length; see unit_directions."""
     if table.are_vectors:
         form = "positions" if form == "positions" else "xyz"
@@ -224,14 +226,14 @@ _MOST_BAD = 0.1  # share of the lights that may be wrong in a file in the right 
 
 
 def unit_directions(
-    vectors: Doubles,
+    vectors: Float64Array,
     path: Path,
     lines: Sequence[int | None],
     places: Sequence[str],
     *,
     lamps: bool = False,
     leave_bad: bool = False,
-) -> Doubles:
+) -> Float64Array:
     """Return vectors (F, 3) at unit length.
 
     Args:
@@ -267,7 +269,7 @@ def unit_directions(
     return directions
 
 
-def read_light_intensities(path: StrPath, n_images: int) -> Doubles:
+def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
@@ -317,7 +319,9 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
 
 
-def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_images: int | None) -> tuple[Doubles, bool]:
+def _one_light_a_row(
+    table: NumberRows, names: dict[int, str], what: str, n_images: int | None
+) -> tuple[Float64Array, bool]:
     """Return the numbers with one light in each row, and whether the file has one light in each column.
 
     `names` has the possible counts of numbers for a light, each with its meaning.
@@ -342,7 +346,7 @@ def _one_light_a_row(table: NumberRows, names: dict[int, str], what: str, n_imag
     raise InputError(problem, path=table.path, hint=hint)
 
 
-def rows_text(values: Doubles) -> str:
+def rows_text(values: Float64Array) -> str:
     """Return rows of numbers (F, C) as the lines of a light file."""
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)
 
@@ -354,8 +358,8 @@ class NamedLights:
     path: Path
     names: tuple[str, ...]  # names of the images, without folders
     lines: tuple[int | None, ...]  # the line of each light in the file; None for each if the file has no lines
-    directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
-    intensities: Doubles | None = None  # (F, 3) float64, RGB, or None if the file has none
+    directions: Float64Array  # (F, 3) float64, unit; x right, y up, z to the camera
+    intensities: Float64Array | None = None  # (F, 3) float64, RGB, or None if the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
@@ -388,7 +392,7 @@ class NamedLights:
 
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
-) -> NamedLights | Doubles:
+) -> NamedLights | Float64Array:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
     The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises InputError; see
@@ -411,12 +415,12 @@ def check_writable(path: Path) -> None:
         raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=hint)
 
 
-def encode_lights(path: Path, directions: Doubles, images: Sequence[Path]) -> bytes:
+def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
     """Return a light file of directions (F, 3) of images, in the format that its suffix names; see check_writable."""
     encode = _written_as(path.suffix.lower())
     assert encode is not None
     return encode(directions, images)
 
 
-def _written_as(suffix: str) -> Callable[[Doubles, Sequence[Path]], bytes] | None:
+def _written_as(suffix: str) -> Callable[[Float64Array, Sequence[Path]], bytes] | None:
     return next((each for each in FORMATS if suffix in each.suffixes), FORMATS[0]).encode

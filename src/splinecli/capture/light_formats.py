@@ -32,7 +32,7 @@ from splinecli.capture.formats.numbers import (
 )
 from splinecli.capture.light_rows import RowForm, image_name
 from splinecli.errors import InputError
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 from splinecli.system.files import parse_json
 
 _MOST_DIGITS = 9  # of the number of lights
@@ -226,7 +226,7 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
 
 
-def _choose(matrices: Mapping[str, Doubles], path: Path, n_images: int | None) -> Doubles:
+def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
     lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
     if len(lights) > 1:
@@ -250,10 +250,10 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
         raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
 
 
-def _read_opencv(path: Path) -> dict[str, Doubles]:
+def _read_opencv(path: Path) -> dict[str, Float64Array]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
     text = read_text(path).decode(errors="replace")
-    found: dict[str, Doubles] = {}
+    found: dict[str, Float64Array] = {}
     for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
         try:
             numbers = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])

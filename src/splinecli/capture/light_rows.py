@@ -19,7 +19,7 @@ from splinecli.capture.formats.numbers import (
     to_number,
 )
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 
 AXIS_WORDS = {
     "x-right": (0, 1),
@@ -42,7 +42,7 @@ class LightFrame:
     exchanged: bool = False  # whether the file has y before x. The signs belong to x and y in either order
 
     @property
-    def matrix(self) -> Doubles:
+    def matrix(self) -> Float64Array:
         """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the camera."""
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
         return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
@@ -116,7 +116,7 @@ _ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format azel"
 
 
-def directions_from_angles(angles_deg: Doubles, form: RowForm) -> Doubles:
+def directions_from_angles(angles_deg: Float64Array, form: RowForm) -> Float64Array:
     """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
 
     Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane towards the camera,
@@ -151,14 +151,14 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
 
 
-def zenith_as_elevation(light_directions: Doubles) -> Doubles:
+def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
     """Return lights (..., 3) with each light's elevation as its angle from the camera axis."""
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
     across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
     return np.concatenate((across, level), axis=-1)
 
 
-def lights_of_half_vectors(half_vectors: Doubles) -> Doubles:
+def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
     """Return the lights (..., 3) that a mirror with these unit normals reflects towards the camera."""
     return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
 
@@ -179,7 +179,7 @@ def refuse_angles(table: NumberRows) -> None:
         raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
 
 
-def _have_one_radius(rows: Doubles) -> bool:
+def _have_one_radius(rows: Float64Array) -> bool:
     """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
     azimuth, elevation, radius = rows.T
     all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli import capture_warnings as codes
-from splinecli.capture.formats.facts import ImageFacts
+from splinecli.capture.formats.facts import ImageHeader
 from splinecli.capture.formats.images import ExpectedSize, decode_image, to_linear
 from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Array, Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 from splinecli.restoration.images import ImageValues, Saturation, look_at, white_level_warnings
 from splinecli.restoration.lamps import COLOUR_SAMPLE, lamp_colours
@@ -60,7 +60,7 @@ class Window:
         self.of(whole)[...] = mask
         return whole
 
-    def camera(self, matrix: Floats) -> Doubles:
+    def camera(self, matrix: Floats) -> Float64Array:
         """Return the camera matrix (3, 3) of the window, from the matrix of whole images."""
         left, top, *_ = self.box or (0, 0)
         to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
@@ -73,7 +73,7 @@ class Window:
         part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
         return whole
 
-    def on(self, image: ImageFacts) -> Window:
+    def on(self, image: ImageHeader) -> Window:
         """Return the window on images of the size of this one. Raises InputError if the box is not inside."""
         if self.is_whole:
             return self
@@ -122,7 +122,7 @@ class RadiometricCalibration:
     flat_field: tuple[Path, ...] = ()
     automatic: bool = False  # whether the curve that all images state is used instead of `curve`
 
-    def with_stated_curve(self, images: Sequence[ImageFacts]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
+    def with_stated_curve(self, images: Sequence[ImageHeader]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
         if self.curve != 1:
             return self, []
@@ -164,7 +164,7 @@ value v then represents light between v - 0.5 and v + 0.5, or between v and v + 
 error in both cases; in dark pixels, this error changes the normals."""
 
 
-def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Singles:
+def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float32Array:
     """Return stored values of any shape as linear light. Raises InputError as to_linear does."""
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
@@ -195,7 +195,7 @@ def pixel_reader(
     window: Window,
     wanted: Integers | slice = EVERY_PIXEL,
     around: Bools | None = None,
-) -> Callable[[Path, int], tuple[Array, Singles]]:
+) -> Callable[[Path, int], tuple[Array, Float32Array]]:
     """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
 
     The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the mask `around` (H, W).
@@ -204,14 +204,14 @@ def pixel_reader(
     image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
     """
     flats = radiometry.flat_field
-    ambient: Singles | None = None
+    ambient: Float32Array | None = None
     if len(flats) not in (0, 1, n_images):
         problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
         raise InputError(problem, path=flats[0].parent)
 
     def pixels(
         path: Path, like: str = "the other images", wanted: Integers | slice = EVERY_PIXEL
-    ) -> tuple[Array, Singles]:
+    ) -> tuple[Array, Float32Array]:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         image = window.of(image)
@@ -220,7 +220,7 @@ def pixel_reader(
         linear = linear_light(used, path, radiometry.curve)
         return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
 
-    def falloff(path: Path) -> Singles:
+    def falloff(path: Path) -> Float32Array:
         stored, linear = pixels(path)
         mean = linear[: len(stored)].mean()
         if mean <= 0:
@@ -231,7 +231,7 @@ def pixel_reader(
         ambient = pixels(radiometry.ambient)[1]
     common = falloff(flats[0]) if len(flats) == 1 else None
 
-    def read(path: Path, index: int) -> tuple[Array, Singles]:
+    def read(path: Path, index: int) -> tuple[Array, Float32Array]:
         stored, linear = pixels(path, like, wanted)
         flat = falloff(flats[index]) if len(flats) > 1 else common
         return stored, linear if flat is None else linear / flat[wanted]
@@ -245,11 +245,11 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    linear: Singles  # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
-    intensity: Doubles  # (3,), RGB, of the light
+    linear: Float32Array  # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
+    intensity: Float64Array  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states, or None
 
-    def observe(self) -> Singles:
+    def observe(self) -> Float32Array:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
 
         A gray image is equal in all channels.
@@ -263,7 +263,7 @@ class StoredPixels:
         """Return the image statistics that decide which pixels are saturated, from look_at. Raises InputError."""
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
-    def colours(self) -> Singles:
+    def colours(self) -> Float32Array:
         """Return linear RGB (P, 3), each channel divided by its intensity."""
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
         colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
@@ -273,7 +273,7 @@ class StoredPixels:
 
 def collect_observations(
     images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None, n_around: int = 0
-) -> tuple[Singles, Saturation, list[CaptureWarning], Doubles | None]:
+) -> tuple[Float32Array, Saturation, list[CaptureWarning], Float64Array | None]:
     """Return observations (P + R, F) of the images in their order, which are saturated, warnings, and colours of lamps.
 
     The last R observations are of pixels around the mask. Everything else concerns the mask alone.
@@ -284,7 +284,7 @@ def collect_observations(
     if it is above an image's full scale.
     """
     observations = np.empty((n_pixels + n_around, n_images), np.float32)
-    any_8_bit, found, colours = False, list[ImageValues](), list[Singles]()
+    any_8_bit, found, colours = False, list[ImageValues](), list[Float32Array]()
     compared = np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8

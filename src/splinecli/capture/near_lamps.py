@@ -23,7 +23,7 @@ from splinecli.capture.light_rows import LightFrame, read_light_rows
 from splinecli.capture.linearise import Window
 from splinecli.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 from splinecli.system.files import is_substitution
@@ -40,17 +40,17 @@ class NearLamps:
         InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
     """
 
-    positions: Doubles  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
+    positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
     pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
     middle: tuple[float, float]  # row and column of the origin, in pixels of the window that was read
     # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
-    reference_distances: Doubles
-    camera_matrix: Doubles | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
-    points: Singles | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
+    reference_distances: Float64Array
+    camera_matrix: Float64Array | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    points: Float32Array | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
     # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
     # is cos(a)^mu, the model of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
     # lamps that emit equally in all directions
-    lobes: Doubles | None = None
+    lobes: Float64Array | None = None
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
@@ -63,13 +63,13 @@ class NearLamps:
     @classmethod
     def of(
         cls,
-        positions: Doubles,
+        positions: Float64Array,
         pixel_size: float,
         shape: tuple[int, ...],
         *,
         equal: bool,
-        camera_matrix: Doubles | None = None,
-        lobes: Doubles | None = None,
+        camera_matrix: Float64Array | None = None,
+        lobes: Float64Array | None = None,
     ) -> NearLamps:
         """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
@@ -85,7 +85,7 @@ class NearLamps:
         middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
 
-    def within(self, left: float, top: float, step: int, camera_matrix: Doubles | None) -> NearLamps:
+    def within(self, left: float, top: float, step: int, camera_matrix: Float64Array | None) -> NearLamps:
         """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
         middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
         return replace(self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix)
@@ -101,7 +101,7 @@ class NearLamps:
             "lobes": None if self.lobes is None else self.lobes.round(4).tolist(),
         }
 
-    def turned(self, directions: Doubles) -> NearLamps:
+    def turned(self, directions: Float64Array) -> NearLamps:
         """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
         distances = np.linalg.norm(self.positions, axis=1, keepdims=True)
         return replace(self, positions=directions * distances)
@@ -116,19 +116,19 @@ class NearLamps:
         """Return the lamps with the surface in some of the pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
-    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Doubles:
+    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Float64Array:
         """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
         middle_row, middle_column = self.middle
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 
-    def extent(self, mask: Bools) -> tuple[tuple[float, float], Doubles]:
+    def extent(self, mask: Bools) -> tuple[tuple[float, float], Float64Array]:
         """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on the mean plane."""
         rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
         width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
-    def angles_across_deg(self, mask: Bools) -> Doubles:
+    def angles_across_deg(self, mask: Bools) -> Float64Array:
         """Return the largest deviation of each lamp's direction (F,) from its direction at the middle of the object.
 
         Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
@@ -138,7 +138,7 @@ class NearLamps:
         directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
         return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
 
-    def light_at(self, points: Floats) -> tuple[Singles, Singles]:
+    def light_at(self, points: Floats) -> tuple[Float32Array, Float32Array]:
         """Return the light at points (P, 3): unit directions (P, F, 3), and attenuations (P, F).
 
         The attenuation is the inverse square of the distance, relative to the light at the lamp's reference distance,
@@ -147,11 +147,11 @@ class NearLamps:
         towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
         towards /= distance[..., None]
-        strengths = np.square(self.reference_distances.astype(np.float32) / distance)
-        return towards, strengths if self.lobes is None else strengths * _within_lobes(self.lobes, towards)
+        attenuation = np.square(self.reference_distances.astype(np.float32) / distance)
+        return towards, attenuation if self.lobes is None else attenuation * _within_lobes(self.lobes, towards)
 
 
-def _within_lobes(lobes: Doubles, towards: Floats) -> Singles:
+def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
     """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
     return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=_LEAST_SHARE)
@@ -246,7 +246,7 @@ class LitSource(Protocol):
     @property
     def n_lights(self) -> int: ...
     @property
-    def light_directions(self) -> Doubles: ...
+    def light_directions(self) -> Float64Array: ...
     @property
     def light_frame(self) -> LightFrame: ...
     @property
@@ -254,7 +254,7 @@ class LitSource(Protocol):
     @property
     def window(self) -> Window: ...
     @property
-    def camera_matrix(self) -> Doubles | None: ...
+    def camera_matrix(self) -> Float64Array | None: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -374,7 +374,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
 
 
-def find_camera(folder: Path, lamps: LampFiles | None, options: LampOptions) -> tuple[Doubles | None, tuple[Any, ...]]:
+def find_camera(
+    folder: Path, lamps: LampFiles | None, options: LampOptions
+) -> tuple[Float64Array | None, tuple[Any, ...]]:
     """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
 
     Raises InputError if the file is wrong.
@@ -401,7 +403,7 @@ def _path(name: str | None) -> Path | None:
     return None if name is None else Path(name)
 
 
-def read_camera_matrix(path: Path) -> Doubles:
+def read_camera_matrix(path: Path) -> Float64Array:
     """Return the camera matrix (3, 3) of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
@@ -411,7 +413,7 @@ def read_camera_matrix(path: Path) -> Doubles:
     return matrix
 
 
-def _read_lobes(path: Path, positions: Doubles, frame: LightFrame) -> Doubles:
+def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float64Array:
     """Return the lobes (F, 4) of NearLamps for lamps at positions (F, 3). Raises InputError."""
     hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
     rows = read_number_rows(path).rows

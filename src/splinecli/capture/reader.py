@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from splinecli import capture_warnings as codes
 from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_files
-from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_facts
+from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import NamedLights, read_light_intensities, read_lights, unit_directions
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
@@ -39,7 +39,7 @@ from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeh
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture_warnings import ESTIMATED_COLOURS, CaptureWarning
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Array, Doubles
+from splinecli.maths import Array, Float64Array
 from splinecli.restoration.images import check_white_level
 from splinecli.restoration.lens_blur import remove_blur, surroundings
 from splinecli.system.files import StrPath
@@ -114,7 +114,7 @@ def open_capture(
         found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
     if files.light_directions is not None and form == "xyz" and near is None:
         warnings += positions_as_directions(files.light_directions)
-    facts = tuple(map(read_facts, files.images))
+    facts = tuple(map(read_header, files.images))
     factors = np.ones((len(facts), 3))
     if found_intensities is None and (exposures := exposure_factors(facts)) is not None:
         factors *= np.array(exposures[0])[:, None]
@@ -181,7 +181,7 @@ def read_capture(
 
 def _read_lights(
     files: CaptureFiles, frame: LightFrame, form: RowForm
-) -> tuple[CaptureFiles, Doubles, Doubles | None, list[CaptureWarning]]:
+) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
     """Return the files in the order of the lights, the directions (F, 3), their intensities (F, 3), and warnings."""
     path = files.light_directions
     if path is None:
@@ -209,8 +209,8 @@ def _read_lights(
 
 
 def _drop_bad_lights(
-    files: CaptureFiles, directions: Doubles, intensities: Doubles | None, warnings: list[CaptureWarning]
-) -> tuple[CaptureFiles, Doubles, Doubles | None, list[CaptureWarning]]:
+    files: CaptureFiles, directions: Float64Array, intensities: Float64Array | None, warnings: list[CaptureWarning]
+) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
     """Return the arguments without the few lights that are zero or below the horizon; see unit_directions."""
     good = directions[:, 2] > 0
     if good.all():
@@ -227,7 +227,7 @@ def _drop_bad_lights(
 
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
-) -> tuple[tuple[Path, ...], Doubles | NamedLights]:
+) -> tuple[tuple[Path, ...], Float64Array | NamedLights]:
     """Return the images that a light file is for, and its lights.
 
     These are all images, or else the images of the usual size, or the images whose names differ only in their numbers.
@@ -254,7 +254,7 @@ _COUNTS = re.compile(r"found (\d+) [a-z ]+, expected \d+, one for each image")
 
 
 def _stated_size(image: Path) -> tuple[int, ...] | None:
-    size = read_facts(image).stated_size
+    size = read_header(image).stated_size
     return None if size is None else size[0][:2]
 
 
@@ -262,7 +262,7 @@ def _name_form(image: Path) -> str:
     return re.sub(r"\d+", "0", image.name.lower())
 
 
-def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Doubles:
+def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Float64Array:
     """Return the intensities (F, 3) of images from a file with a line for each, or for each image of the folder."""
     if len(images) < len(in_folder):
         with suppress(InputError):  # the file is for the chosen images, or wrong in any case
@@ -371,7 +371,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
     return stack
 
 
-def _checked_directions(directions: ArrayLike, n_lights: int) -> Doubles:
+def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
     vectors = np.asarray(directions, np.float64)
     if vectors.shape != (n_lights, 3):
         raise UsageError(
@@ -383,7 +383,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> Doubles:
     return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
 
 
-def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Doubles:
+def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float64Array:
     """Return intensities (F, 3); ones where none are given."""
     if intensities is None:
         return np.ones((n_lights, 3))

@@ -12,7 +12,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Array, Bools, Doubles, Integers, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.restoration.images import Saturation, WhiteLevel, restore_saturated
 from splinecli.restoration.lamps import estimate_light_intensities
 from splinecli.surface.pixel_grid import ray_basis
@@ -36,9 +36,9 @@ ESTIMATE = "estimate"  # given instead of a light file: the lights are estimated
 class FoundLights:
     """Lights of F images."""
 
-    directions: Doubles  # (F, 3) float64, unit; x right, y up, z to the camera
-    errors_deg: Doubles  # (F,), the expected errors of the directions in degrees
-    intensities: Doubles | None = None  # (F,), with a mean of 1; None if they are known
+    directions: Float64Array  # (F, 3) float64, unit; x right, y up, z to the camera
+    errors_deg: Float64Array  # (F,), the expected errors of the directions in degrees
+    intensities: Float64Array | None = None  # (F,), with a mean of 1; None if they are known
 
 
 def azimuth_of(first_light: str) -> float:
@@ -60,13 +60,13 @@ def azimuth_of(first_light: str) -> float:
     return azimuth
 
 
-def placeholders(n_lights: int) -> Doubles:
+def placeholders(n_lights: int) -> Float64Array:
     """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are estimated."""
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
 
-LightFinder = Callable[[Singles, Bools, bool], FoundLights]
+LightFinder = Callable[[Float32Array, Bools, bool], FoundLights]
 """Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""
 
 
@@ -127,20 +127,20 @@ class Capture:
     """
 
     name: str
-    observations: Singles
-    light_directions: Doubles
+    observations: Float32Array
+    light_directions: Float64Array
     light_indices: tuple[int, ...]
     mask: Bools
-    ground_truth: Singles | None = None
+    ground_truth: Float32Array | None = None
     warnings: tuple[CaptureWarning, ...] = ()
-    estimated_intensities: Doubles | None = None
-    estimated_colours: Doubles | None = None
+    estimated_intensities: Float64Array | None = None
+    estimated_colours: Float64Array | None = None
     restored: Bools | None = None
     white_level: WhiteLevel | None = None
     removed_blur: float | None = None
     lamps: NearLamps | None = None
-    light_errors_deg: Doubles | None = None
-    camera_matrix: Doubles | None = None
+    light_errors_deg: Float64Array | None = None
+    camera_matrix: Float64Array | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -249,7 +249,7 @@ class Capture:
                 raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
 
 
-def in_one_plane(light_directions: Doubles) -> bool:
+def in_one_plane(light_directions: Float64Array) -> bool:
     """Return whether lights (F, 3) are coplanar, so that Capture rejects them."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
     return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
@@ -272,7 +272,7 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
     return chosen
 
 
-def _blocks(rows: Singles) -> Iterator[Singles]:
+def _blocks(rows: Float32Array) -> Iterator[Float32Array]:
     for start in range(0, len(rows), _BLOCK):
         yield rows[start : start + _BLOCK]
 
@@ -294,7 +294,7 @@ class StoredCapture:
     capture: Capture  # linear observations, divided by the light intensities that the files give
     saturation: Saturation
     intensities_known: bool  # whether a file, an option or the image format gives the light intensities
-    found_intensities: Doubles | None = None  # (F,), estimated together with the directions, or None
+    found_intensities: Float64Array | None = None  # (F,), estimated together with the directions, or None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
         """Return the capture under lights that are estimated from these observations.
@@ -322,13 +322,13 @@ class StoredCapture:
         """Return the capture with these rising rows of its observations, with arrays of its own."""
         return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
-    def estimate_intensities(self) -> Doubles | None:
+    def estimate_intensities(self) -> Float64Array | None:
         """Return light intensities (F,) estimated from all pixels; None if they are known or assumed equal."""
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
         return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
 
-    def restore(self, intensities: Doubles | None) -> Capture:
+    def restore(self, intensities: Float64Array | None) -> Capture:
         """Return the capture with its intensities divided out and its saturated observations restored.
 
         The observations are changed in place: this record must not be used afterwards.
@@ -352,11 +352,11 @@ class StoredCapture:
             return self.capture
         return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)
 
-    def _lights_of(self, rows: Integers) -> Doubles:
+    def _lights_of(self, rows: Integers) -> Float64Array:
         """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near lamps on a plane."""
         lamps = self.capture.lamps
         if lamps is None:
             return self.capture.light_directions
         places = np.flatnonzero(self.capture.mask)[rows]
-        directions, strengths = lamps.light_at(lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1])))
-        return np.asarray(directions * strengths[..., None], np.float64)
+        directions, attenuation = lamps.light_at(lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1])))
+        return np.asarray(directions * attenuation[..., None], np.float64)

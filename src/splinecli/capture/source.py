@@ -12,7 +12,7 @@ import numpy as np
 
 from splinecli.capture.files import CaptureFiles
 from splinecli.capture.formats.decoders import stderr_is_apart
-from splinecli.capture.formats.facts import ImageFacts, StoredSize
+from splinecli.capture.formats.facts import ImageHeader, StoredSize
 from splinecli.capture.formats.images import (
     ExpectedSize,
     check_memory,
@@ -38,7 +38,7 @@ from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, 
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Doubles, Integers
+from splinecli.maths import Bools, Float64Array, Integers
 from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
 from splinecli.restoration.lens_blur import remove_blur, surroundings
 
@@ -57,9 +57,9 @@ class CaptureSource:
     """An opened capture: lights and facts of images loaded, pixels still on disk."""
 
     files: CaptureFiles
-    facts: tuple[ImageFacts, ...]
-    light_directions: Doubles  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: Doubles  # (F, 3), RGB; ones if no file gives them
+    facts: tuple[ImageHeader, ...]
+    light_directions: Float64Array  # (F, 3), unit; x right, y up, z to the camera. See find_lights
+    light_intensities: Float64Array  # (F, 3), RGB; ones if no file gives them
     warnings: tuple[CaptureWarning, ...] = ()
     radiometry: RadiometricCalibration = AS_STORED
     white_level: float | None = None  # stored value from which an observation is saturated; None to find it
@@ -69,7 +69,7 @@ class CaptureSource:
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
     light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # the near lamps of files and options, or None
-    camera_matrix: Doubles | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
+    camera_matrix: Float64Array | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
     # JSON values that change when a file that is read for the capture, or the given white level, does. They are taken

@@ -21,7 +21,7 @@ from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import solve_each
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
-from splinecli.maths import Doubles, Floats
+from splinecli.maths import Float64Array, Floats
 from splinecli.system.files import equal_files, reading
 
 
@@ -30,14 +30,14 @@ class CaptureSample:
     """F images and their lights, the input of the checks; results that several checks need are computed once."""
 
     names: Sequence[str]
-    all_directions: Doubles  # (N, 3), all lights of the file, in its order
+    all_directions: Float64Array  # (N, 3), all lights of the file, in its order
     indices: Sequence[int]  # (F,), the lights of the images
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
     intensities_known: bool  # whether they are given, or the user states that they are equal
-    intensities: Doubles | None = None  # (F,), the given ones, by which the observations were divided
-    estimated: Doubles | None = None  # (F,), the estimated ones, by which the sample was not divided
+    intensities: Float64Array | None = None  # (F,), the given ones, by which the observations were divided
+    estimated: Float64Array | None = None  # (F,), the estimated ones, by which the sample was not divided
     eight_bit: bool = False  # whether the images have 8 bits
     lamps: NearLamps | None = None  # all near lamps, over the sample's grid; None if the lights are treated as distant
     has_positions: bool = False  # whether positions of lamps are known
@@ -89,7 +89,7 @@ class CaptureSample:
         )
 
     @cached_property
-    def directions(self) -> Doubles:
+    def directions(self) -> Float64Array:
         """The directions (F, 3) of the images' lights."""
         return self.all_directions[list(self.indices)]
 
@@ -188,7 +188,7 @@ class CaptureSample:
         return median_turn_deg(self.evened.observations[known], self.directions, self.directions, values[known])
 
 
-def gray_intensities(intensities: Floats) -> Doubles:
+def gray_intensities(intensities: Floats) -> Float64Array:
     """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are divided out."""
     values = np.asarray(intensities, np.float64)
     if values.ndim == 2:

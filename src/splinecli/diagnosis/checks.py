@@ -17,7 +17,7 @@ from splinecli.errors import InputError
 from splinecli.fits.robust import fit_robustly
 from splinecli.lights.light_fit import would_refine
 from splinecli.lights.rough_normals import median_turn_deg
-from splinecli.maths import Doubles, Floats
+from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg
 from splinecli.restoration.lamps import estimate_light_intensities
 
@@ -313,7 +313,7 @@ def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWa
     return None if seen.found else seen.light_check, warnings
 
 
-def light_spread(light_directions: Doubles) -> tuple[float, bool]:
+def light_spread(light_directions: Float64Array) -> tuple[float, bool]:
     """Return how well lights (F, 3) determine a normal, and whether they form a cone rather than a plane.
 
     The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation

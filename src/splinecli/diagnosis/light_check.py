@@ -19,7 +19,7 @@ from splinecli.diagnosis.light_order import HALF_VECTORS, ORDER, UNKNOWN_ORDER, 
 from splinecli.diagnosis.odd_images import OddImage, find_odd_image
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import RoughNormals, ShadowCheck, median_turn_deg, rough_normals
-from splinecli.maths import Bools, Doubles, Floats, Integers
+from splinecli.maths import Bools, Float64Array, Floats, Integers
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Candidate:
 
     name: str  # in words, such as "y negated"
     frame: LightFrame | None  # its frame, relative to the given one. None for an order that no frame is equivalent to
-    matrix: Doubles = field(compare=False)  # (3, 3) M, where lights @ M' are the lights in this reading
+    matrix: Float64Array = field(compare=False)  # (3, 3) M, where lights @ M' are the lights in this reading
     curl: float  # of the normals; 0 is a surface
     rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
     is_order: bool = False  # whether it is another order of the lights
@@ -69,7 +69,7 @@ class LightCheck:
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
     # (F, 3), the lights of the observations in the best reading; None if the given one is the best, or no reading
     # clearly is
-    mended: Doubles | None
+    mended: Float64Array | None
     # the median angle by which the given lights change the normals, if the best reading is right; None if the given is
     error_deg: float | None = None
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
@@ -104,7 +104,7 @@ class LightCheck:
 def check_lights(
     observations: Floats,
     mask: Bools,
-    light_directions: Doubles,
+    light_directions: Float64Array,
     indices: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
@@ -136,7 +136,7 @@ def check_lights(
 def _check_frame_and_order(
     observations: Floats,
     mask: Bools,
-    light_directions: Doubles,
+    light_directions: Float64Array,
     chosen: Integers,
     names: Sequence[str],
     factors: Factors | None,
@@ -148,7 +148,7 @@ def _check_frame_and_order(
     weight = (normals.rim_steepness - FRAME.rim_from) / (FRAME.rim_fully - FRAME.rim_from)
     weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
 
-    def candidate(name: str, frame: LightFrame | None, matrix: Doubles, **kind: Any) -> Candidate:
+    def candidate(name: str, frame: LightFrame | None, matrix: Float64Array, **kind: Any) -> Candidate:
         turned = normals.transformed(matrix)
         return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, **kind)
 
@@ -191,7 +191,7 @@ def _check_frame_and_order(
     )
 
 
-def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Doubles]]:
+def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
     """Yield rotations of the lights about the view axis after which the normals have the least curl, in words."""
     for mirrored in (False, True):
         least_deg = normals.least_curl_deg(mirrored=mirrored)

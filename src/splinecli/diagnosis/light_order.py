@@ -27,7 +27,7 @@ from splinecli.lights.light_fit import (
     shifted_orders,
     swapped_orders,
 )
-from splinecli.maths import Bools, Doubles, Floats, Integers
+from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
 
 FEWEST_IN_RING = 4
@@ -43,7 +43,7 @@ _WAYS = {
 """The step through the lamps of a ring, and the signs of x and y."""
 
 
-def mend_rings(factors: Factors, lights: Doubles) -> tuple[str, Doubles, float]:
+def mend_rings(factors: Factors, lights: Float64Array) -> tuple[str, Float64Array, float]:
     """Return corrections of the rings of lights (F, 3), in words (none if they fit), the new lights and their residual.
 
     Rings are corrected one after the other, the best first, as long as the images fit clearly better. The search starts
@@ -63,7 +63,7 @@ def mend_rings(factors: Factors, lights: Doubles) -> tuple[str, Doubles, float]:
 
 
 class _Mended(NamedTuple):
-    lights: Doubles  # (F, 3)
+    lights: Float64Array  # (F, 3)
     misfit: float
     rings: list[tuple[Integers, str]]  # the lights of each ring that is read otherwise, and how
 
@@ -72,10 +72,10 @@ class _Mended(NamedTuple):
         return len(self.rings), sum(len(words) for _, words in self.rings)
 
 
-_Trials = list[list[tuple[str, Doubles]]]  # of each ring, its readings; the first as given
+_Trials = list[list[tuple[str, Float64Array]]]  # of each ring, its readings; the first as given
 
 
-def _seen_from(anchor: int, matrix: Doubles, rings: list[Integers], trials: _Trials) -> list[int]:
+def _seen_from(anchor: int, matrix: Float64Array, rings: list[Integers], trials: _Trials) -> list[int]:
     """Return the reading of each ring that fits the factors' matrix (3, F) if one ring is right."""
     # One ring determines the 3 x 3 matrix between lights and factors. Intensities are left out.
     to_factors = matrix[:, rings[anchor]] @ np.linalg.pinv(trials[anchor][0][1].T)
@@ -89,7 +89,7 @@ def _seen_from(anchor: int, matrix: Doubles, rings: list[Integers], trials: _Tri
 
 
 def _descend(
-    factors: Factors, lights: Doubles, rings: list[Integers], trials: _Trials, start: Sequence[int]
+    factors: Factors, lights: Float64Array, rings: list[Integers], trials: _Trials, start: Sequence[int]
 ) -> _Mended:
     """Return the best readings of rings from a start, changed one after the other."""
     mended, chosen = lights.copy(), list(start)
@@ -112,7 +112,7 @@ def _descend(
     return _Mended(mended, misfit, [(lamps, how) for lamps, how in words if how])
 
 
-def find_rings(lights: Doubles) -> Iterator[list[Integers]]:
+def find_rings(lights: Float64Array) -> Iterator[list[Integers]]:
     """Yield divisions of the lights (F, 3) into rings, as the indices of the lights of each ring that has enough."""
     elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
     order = elevation.argsort(kind="stable")
@@ -124,7 +124,7 @@ def find_rings(lights: Doubles) -> Iterator[list[Integers]]:
             yield rings
 
 
-def _rounds(lights: Doubles) -> list[Integers]:
+def _rounds(lights: Float64Array) -> list[Integers]:
     """Return the indices of the lights (F, 3) of each ring, where the azimuth goes once round each ring in the file.
 
     This separates rings at nearly the same elevation. The list is empty if the azimuth does anything else.
@@ -143,7 +143,7 @@ def _rounds(lights: Doubles) -> list[Integers]:
     return rings if in_order and sum(map(len, rings)) > 0.8 * len(lights) else []
 
 
-def _readings(given: Doubles) -> Iterator[tuple[str, Doubles]]:
+def _readings(given: Float64Array) -> Iterator[tuple[str, Float64Array]]:
     """Yield the readings of a ring (n, 3), in words and directions (n, 3), the simplest first."""
     for steps in sorted(range(len(given)), key=lambda steps: min(steps, len(given) - steps)):
         shift = "" if steps == 0 else f"shifted by {min(steps, steps - len(given), key=abs):+d}"
@@ -206,7 +206,7 @@ class Turn(NamedTuple):
 
     words: str
     steps: int
-    matrix: Doubles
+    matrix: Float64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +214,10 @@ class LightOrder:
     """The order of lights that fits best."""
 
     order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
-    lights: Doubles  # (F, 3), in this order
-    intensities: Doubles  # (F,), that fit these lights best, for metals; ones if only known ones determine the order
+    lights: Float64Array  # (F, 3), in this order
+    intensities: (
+        Float64Array  # (F,), that fit these lights best, for metals; ones if only known ones determine the order
+    )
     given_misfit: float = np.nan  # as a share of random orders'; NaN with too few lights
     misfit: float = np.nan  # the same for this order
     plausible: bool = True  # whether the lights fit well enough for the normals to show an outline
@@ -227,12 +229,16 @@ class _Reading(NamedTuple):
     """An order of the lights: in words, or None for the given one; its lights (F, 3) and their residual."""
 
     words: str | None
-    lights: Doubles
+    lights: Float64Array
     misfit: float
 
 
 def check_order(
-    observations: Floats, factors: Factors | None, light_directions: Doubles, chosen: Integers, names: Sequence[str]
+    observations: Floats,
+    factors: Factors | None,
+    light_directions: Float64Array,
+    chosen: Integers,
+    names: Sequence[str],
 ) -> LightOrder:
     """Return the order of the chosen lights that fits observations (P, F) best.
 
@@ -296,7 +302,7 @@ def check_order(
     )
 
 
-def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, doubled: Doubles) -> bool:
+def _are_half_vectors(observations: Floats, factors: Factors, lights: Float64Array, doubled: Float64Array) -> bool:
     """Return whether the lights (F, 3) with doubled angles from the axis fit clearly better."""
     better = False
     for known in (True, False):
@@ -309,7 +315,7 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Doubles, d
     return better or _brighten_as_half_vectors(observations, lights, doubled)
 
 
-def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Doubles) -> bool:
+def _brighten_as_half_vectors(observations: Floats, lights: Float64Array, doubled: Float64Array) -> bool:
     """Return whether the albedo under lights (F, 3) changes with the slope as it does under half vectors."""
     chosen, values = lit_values(observations, LIT_SHARE, _FITTED_PIXELS)
     lit = shadow_weights(values)
@@ -328,7 +334,7 @@ def _brighten_as_half_vectors(observations: Floats, lights: Doubles, doubled: Do
     return bool(solution[1] > 0.65 and change.std() > 0.1)
 
 
-def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _Reading:
+def _best_exchange(factors: Factors, lights: Float64Array, names: Sequence[str]) -> _Reading:
     swaps = swapped_orders(len(lights))
     misfits = factors.misfits(lights[swaps])
     best = int(misfits.argmin())
@@ -336,7 +342,7 @@ def _best_exchange(factors: Factors, lights: Doubles, names: Sequence[str]) -> _
     return _Reading(f"with those of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
 
 
-def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Doubles) -> bool:
+def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Float64Array) -> bool:
     """Return whether lights fit no better than in random orders, whose residuals are given."""
     n_lights = len(given.lights)
     # An order is wrong if more than this share of random orders fits as well.
@@ -357,7 +363,7 @@ def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
     return bool(misfit <= 0.5 * max(float(np.median(random)), 1e-9))
 
 
-def _free_if_possible(factors: Factors, lights: Doubles) -> tuple[Factors, Doubles]:
+def _free_if_possible(factors: Factors, lights: Float64Array) -> tuple[Factors, Float64Array]:
     """Return factors to compare with lights of free intensities, if these determine orders, and random residuals."""
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
@@ -367,7 +373,7 @@ def _free_if_possible(factors: Factors, lights: Doubles) -> tuple[Factors, Doubl
     return free, random
 
 
-def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -> bool:
+def _fits_like_random(observations: Floats, factors: Factors, lights: Float64Array) -> bool:
     """Return whether lights fit the pixels little better than in random orders."""
     # The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
     values = sample_pixels(observations)
@@ -380,7 +386,7 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Doubles) -
     return given > 0.7 * float(np.median(random))
 
 
-def _turns(lights: Doubles, shifted: Doubles, fitting: Bools) -> tuple[Turn, ...]:
+def _turns(lights: Float64Array, shifted: Float64Array, fitting: Bools) -> tuple[Turn, ...]:
     """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights (F, 3) in place."""
     inverse, n_all = np.linalg.pinv(lights), len(shifted) // 2
     turns = []

@@ -24,7 +24,7 @@ from splinecli.capture_warnings import CaptureWarning
 from splinecli.diagnosis.summary import Sample
 from splinecli.lights.light_fit import Factors
 from splinecli.lights.rough_normals import rough_normals
-from splinecli.maths import Bools, Doubles, Floats, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg
 
 
@@ -51,7 +51,7 @@ class OddImage:
     brightness: float | None = None
 
 
-def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | None:
+def find_odd_image(factors: Factors, light_directions: Float64Array) -> OddImage | None:
     """Return the image that contradicts the others under lights (F, 3), or None."""
     if len(light_directions) < ODD.min_lights:
         return None
@@ -74,7 +74,7 @@ def find_odd_image(factors: Factors, light_directions: Doubles) -> OddImage | No
     return None
 
 
-def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
+def _shares_left(factors: Factors, light_directions: Float64Array) -> Float64Array:
     """Return the root mean square residuals (F,) without each image, as shares of all images' residual."""
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
@@ -87,7 +87,7 @@ def _shares_left(factors: Factors, light_directions: Doubles) -> Doubles:
     return np.asarray(np.sqrt(np.maximum(left, 0) * n_lights / (n_lights - 1)) / misfit)
 
 
-def _brightness(factors: Factors, light_directions: Doubles, place: int) -> float | None:
+def _brightness(factors: Factors, light_directions: Float64Array, place: int) -> float | None:
     """Return the brightness of an image as a share of the others' prediction; None if it is not only scaled."""
     if not factors.intensities_known:
         return None
@@ -146,7 +146,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     return shifts_against(still) if found and len(still) >= SHIFT.predictors else found
 
 
-def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles]:
+def _predictions(values: Float32Array, predictors: Sequence[int]) -> Iterator[Float32Array]:
     """Yield the prediction (P,) of each image of (P, F) by the three strongest factors of the predictors."""
     products = values.T @ values
     for place in range(len(products)):
@@ -158,7 +158,7 @@ def _predictions(values: Singles, predictors: Sequence[int]) -> Iterator[Singles
         yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
 
 
-def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> tuple[int, int] | None:
+def _shift(image: Float32Array, predicted: Float32Array, mask: Bools, inner: Float32Array) -> tuple[int, int] | None:
     """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images agrees; or None."""
     detail, expected = _detail(image, mask), _detail(predicted, mask)
     correlations = _correlations(detail, expected, inner)
@@ -184,7 +184,7 @@ def _shift(image: Singles, predicted: Singles, mask: Bools, inner: Singles) -> t
     return right, down
 
 
-def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles:
+def _correlations(detail: Float32Array, expected: Float32Array, inner: Float32Array) -> Float32Array:
     """Return the correlations of two images (H, W) at shifts down and right up to SHIFT.largest."""
     import cv2
 
@@ -194,12 +194,12 @@ def _correlations(detail: Singles, expected: Singles, inner: Singles) -> Singles
     return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
 
 
-def _peak(correlations: Singles) -> tuple[int, int]:
+def _peak(correlations: Float32Array) -> tuple[int, int]:
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
     return int(right) - SHIFT.largest, int(down) - SHIFT.largest
 
 
-def _halves(inner: Singles) -> Iterator[Singles]:
+def _halves(inner: Float32Array) -> Iterator[Float32Array]:
     """Yield the left, right, upper and lower half of the pixels of a map (H, W)."""
     for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
         yield inner * (places <= middle)
@@ -211,13 +211,13 @@ def _top(before: float, middle: float, after: float) -> float:
     return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
 
 
-def _detail(values: Singles, mask: Bools) -> Singles:
+def _detail(values: Float32Array, mask: Bools) -> Float32Array:
     """Return values (P,) without their blur, over the local contrast, on a map (H, W); zero outside the mask."""
     import cv2
 
     inside = mask.astype(np.float32)
 
-    def blur(array: Singles, deviation: float) -> Singles:
+    def blur(array: Float32Array, deviation: float) -> Float32Array:
         weight = cv2.GaussianBlur(inside, (0, 0), deviation)
         return np.asarray(cv2.GaussianBlur(array, (0, 0), deviation) / np.maximum(weight, 1e-3), np.float32)
 
@@ -231,7 +231,7 @@ def _detail(values: Singles, mask: Bools) -> Singles:
     return np.asarray(detail.clip(-SHIFT.most_detail, SHIFT.most_detail), np.float32)
 
 
-def _inner(mask: Bools) -> Singles:
+def _inner(mask: Bools) -> Float32Array:
     """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
     import cv2
 
@@ -257,7 +257,7 @@ TRUTH = TruthLimits()
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
 
 
-def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats | None) -> list[CaptureWarning]:
+def check_ground_truth(sample: Sample, light_directions: Float64Array, truth: Floats | None) -> list[CaptureWarning]:
     """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame, or when moved.
 
     It covers the whole images: unit normals, or zero without ground truth. None gives no warning.
@@ -285,7 +285,7 @@ def check_ground_truth(sample: Sample, light_directions: Doubles, truth: Floats 
     return [CaptureWarning(kind, text, angles[0] if kind == codes.GROUND_TRUTH_FRAME else None)]
 
 
-def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWarning]:
+def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[CaptureWarning]:
     """Warn of a ground truth (h, w, 3) that fits normals (h, w, 3) much better when it is moved."""
     rows, columns = np.nonzero(sample.mask)
     reach = max(1, round(TRUTH.reach * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
@@ -318,14 +318,14 @@ def _shifted(normals: Doubles, truth: Floats, sample: Sample) -> list[CaptureWar
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 
 
-def _rotated_angle_deg(normals: Doubles, truth: Floats) -> float:
+def _rotated_angle_deg(normals: Float64Array, truth: Floats) -> float:
     """Return the median angle between normals (P, 3) and a truth after the best rotation (Kabsch 1976)."""
     left, _, right = np.linalg.svd(normals.T @ truth)
     rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right)))) @ right
     return float(np.median(angle_between_deg(normals, truth @ rotation.T)))
 
 
-def _angles_deg(normals: Doubles, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:
+def _angles_deg(normals: Float64Array, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:
     """Return the median angles in degrees between normals and a truth that is moved back, and not moved."""
     height, width = normals.shape[:2]
     right, down = shift

@@ -20,7 +20,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import absolute_weights, fit_scaled_normals, lit_values, shade
-from splinecli.maths import Doubles, Integers
+from splinecli.maths import Float64Array, Integers
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]
@@ -71,8 +71,8 @@ class Reading:
     amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
     ratio: float  # residual over the given reading's, on the same observations
     evidence: float  # logarithm of its probability over the given reading's
-    normals: Doubles  # (p, 3), scaled, at the chosen pixels
-    intensities: Doubles  # (F,), mean 1; ones unless they are free
+    normals: Float64Array  # (p, 3), scaled, at the chosen pixels
+    intensities: Float64Array  # (F,), mean 1; ones unless they are free
 
 
 class Doubt(NamedTuple):
@@ -86,8 +86,8 @@ class Doubt(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class _Fit:
     residual: float
-    normals: Doubles
-    intensities: Doubles
+    normals: Float64Array
+    intensities: Float64Array
 
 
 class Readings:
@@ -101,7 +101,7 @@ class Readings:
     """
 
     def __init__(
-        self, sample: Sample, lights: Doubles, intensities: Doubles | None = None, *, eight_bit: bool = False
+        self, sample: Sample, lights: Float64Array, intensities: Float64Array | None = None, *, eight_bit: bool = False
     ) -> None:
         n_lights = len(lights)
         chosen, values = lit_values(
@@ -169,7 +169,7 @@ class Readings:
         others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
         return Doubt(best, sum(shares.values()), tuple(others))
 
-    def error_deg(self, reading: Reading, used: Doubles | None = None) -> float:
+    def error_deg(self, reading: Reading, used: Float64Array | None = None) -> float:
         """Return the median angle in degrees between a reading's normals and the given reading's.
 
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
@@ -196,7 +196,7 @@ class Readings:
         cost += 1.3 if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0.0
         return replace(best, evidence=best.evidence - cost)
 
-    def _offset_fits(self, vectors: Doubles) -> dict[float, _Fit]:
+    def _offset_fits(self, vectors: Float64Array) -> dict[float, _Fit]:
         """Return fits with constant light, also between the two of OFFSETS around the best one."""
         fits = {offset: _fit(self.values, vectors, offset=offset) for offset in OFFSETS}
         for _ in range(3):  # halve the interval around the best constant light
@@ -207,12 +207,12 @@ class Readings:
                 fits[between] = _fit(self.values, vectors, offset=between)
         return fits
 
-    def _near(self, widths: float) -> Doubles:
+    def _near(self, widths: float) -> Float64Array:
         lamps = NearLamps.of(self.lights * widths * self.width, 1.0, self.shape, equal=True)
         directions, attenuations = lamps.light_at(lamps.plane_points(self.rows, self.columns))
         return np.asarray(directions * attenuations[..., None], np.float64)
 
-    def _with(self, lights: Doubles) -> Doubles:
+    def _with(self, lights: Float64Array) -> Float64Array:
         return lights if self.intensities is None else lights * self.intensities[:, None]
 
 
@@ -237,15 +237,15 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 
-def _cost_of_equal(intensities: Doubles) -> float:
+def _cost_of_equal(intensities: Float64Array) -> float:
     # Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by
     # the standard deviation of their logarithms.
     return float(10.0 * np.exp(-((np.std(np.log(intensities)) / 0.15) ** 2)))
 
 
 def _fit(
-    values: Doubles,
-    lights: Doubles,
+    values: Float64Array,
+    lights: Float64Array,
     gamma: float = 1.0,
     *,
     offset: float = 0.0,
@@ -284,7 +284,9 @@ def _fit(
     return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
 
 
-def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Doubles) -> Doubles:
+def _intensities(
+    observed: Float64Array, equal: Float64Array, weights: Float64Array, before: Float64Array
+) -> Float64Array:
     """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity 1."""
     weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
     power = (weights * equal**2).sum(axis=0)
@@ -294,7 +296,7 @@ def _intensities(observed: Doubles, equal: Doubles, weights: Doubles, before: Do
     return np.asarray(intensities / intensities.mean())
 
 
-def _roundness(normals: Doubles, places: Integers) -> float:
+def _roundness(normals: Float64Array, places: Integers) -> float:
     """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
     across = unit(normals)[:, :2]
     terms = np.concatenate((across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import fit_robustly, inverse_3x3, multiply_symmetric
-from splinecli.maths import Bools, Doubles
+from splinecli.maths import Bools, Float64Array
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ Shift = tuple[int, int]  # right, down
 _NO_SHIFT = 0.0, (0, 0)
 
 
-def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift]:
+def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, Shift]:
     """Return the shifts in pixels of the sample of images that are shifted, by place, under lights (F, 3)."""
     # Rows and columns of larger captures are left out.
     stride = int(np.ceil(np.sqrt(sample.observations.size / 200_000)))
@@ -78,7 +78,7 @@ def shading_shifts(sample: Sample, light_directions: Doubles) -> dict[int, Shift
     return {place: (stride * right, stride * down) for place, (right, down) in model.shifts.items()}
 
 
-def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Doubles]:
+def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Float64Array]:
     """Return which pixels (P,) all images show, moved back by shifts in pixels of the sample, and all values (P, F)."""
     known, values = np.ones(len(sample.observations), np.bool_), sample.observations.astype(np.float64)
     image = np.zeros(sample.mask.shape)
@@ -92,16 +92,16 @@ def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Doub
 class _Compared(NamedTuple):
     """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and their components."""
 
-    left: Doubles
-    unmoved: Doubles
-    maps: tuple[Doubles, Doubles, Doubles, Doubles]
+    left: Float64Array
+    unmoved: Float64Array
+    maps: tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 
 
 class _MatteModel:
     """Scaled normals of images (F, H, W), of which some were moved back by their shifts."""
 
     def __init__(
-        self, images: Doubles, mask: Bools, light_directions: Doubles, fitted: Sequence[int] | None = None
+        self, images: Float64Array, mask: Bools, light_directions: Float64Array, fitted: Sequence[int] | None = None
     ) -> None:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
@@ -130,7 +130,7 @@ class _MatteModel:
         products = self._weights @ np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
         self._covariance = inverse_3x3(tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6)
 
-    def _without(self, place: int) -> Doubles:
+    def _without(self, place: int) -> Float64Array:
         """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are implausible."""
         light, weights = self.lights[place], self._weights[:, place]
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
@@ -193,13 +193,15 @@ class _MatteModel:
         known = np.isfinite(shares) & np.isfinite(unmoved)
         return _least(np.where(known, shares * unmoved, np.inf), unmoved, *LIMITS.of_half, usual)
 
-    def _left_in_halves(self, scaled: Doubles, good: Doubles, kept: Doubles, image: Doubles, shift: Shift) -> float:
+    def _left_in_halves(
+        self, scaled: Float64Array, good: Float64Array, kept: Float64Array, image: Float64Array, shift: Shift
+    ) -> float:
         """Return the median share that a shift leaves in the upper, lower, left and right half.
 
         Gloss looks shifted on the side of the highlight alone.
         """
 
-        def residuals(image: Doubles, kept: Doubles) -> Doubles:
+        def residuals(image: Float64Array, kept: Float64Array) -> Float64Array:
             inside = (kept * good) > 0
             light = np.linalg.lstsq(scaled[:, inside].T, image[inside], rcond=None)[0]
             return np.where(inside, np.abs(image - np.tensordot(light, scaled, 1)), np.nan)
@@ -215,13 +217,13 @@ class _MatteModel:
                     shares.append(found[0].mean() / max(found[1].mean(), 1e-12))
         return float(np.median(shares)) if shares else np.inf
 
-    def _map(self, values: Doubles | Bools) -> Doubles:
+    def _map(self, values: Float64Array | Bools) -> Float64Array:
         """Return values (P,) or (P, K) on a map (H, W) or (K, H, W), zero outside the mask."""
         array = np.zeros((*values.shape[1:], *self.mask.shape))
         array[..., self.mask] = values.T
         return array
 
-    def _sums(self, first: Doubles, second: Doubles | Bools) -> Doubles:
+    def _sums(self, first: Float64Array, second: Float64Array | Bools) -> Float64Array:
         """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right) within reach."""
         from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -231,7 +233,9 @@ class _MatteModel:
         return np.asarray(sums[..., around[:, None], around])
 
 
-def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float, usual: float) -> tuple[float, Shift]:
+def _least(
+    left: Float64Array, unmoved: Float64Array, least_fall: float, most_left: float, usual: float
+) -> tuple[float, Shift]:
     """Return the fall of the residual at the shift with the smallest remaining share; residuals are (h, w)."""
     reach = len(left) // 2
     around = np.abs(np.arange(-reach, reach + 1))
@@ -248,7 +252,7 @@ def _least(left: Doubles, unmoved: Doubles, least_fall: float, most_left: float,
     return float(unmoved[row, column] - left[row, column]), (int(column) - reach, int(row) - reach)
 
 
-def _residual(count: Doubles, products: Doubles, sums: Doubles, squares: Doubles) -> Doubles:
+def _residual(count: Float64Array, products: Float64Array, sums: Float64Array, squares: Float64Array) -> Float64Array:
     """Return root mean square residuals at each shift (h, w) of a fit with the best light.
 
     From the sums over pixels of scaled normals times each other (9, h, w), and of images times these (3, h, w).
@@ -261,7 +265,7 @@ def _residual(count: Doubles, products: Doubles, sums: Doubles, squares: Doubles
     return np.asarray(np.sqrt(np.maximum(squares - explained, 0) / np.maximum(count, 1)))
 
 
-def _moved(image: Doubles | Bools, shift: Shift) -> Doubles:
+def _moved(image: Float64Array | Bools, shift: Shift) -> Float64Array:
     """Return image(x + shift) on the same map; zero where x + shift is outside."""
     moved = np.zeros(image.shape)
     to, source = (

@@ -12,7 +12,7 @@ from splinecli.capture.linearise import AS_STORED, WHOLE, StoredPixels
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture_warnings import SATURATED_SHARE, CaptureWarning
 from splinecli.errors import InputError
-from splinecli.maths import Bools, Doubles, Floats
+from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.restoration.images import Saturation, WhiteLevel, find_object, find_saturated, white_level_warnings
 
 MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on
@@ -118,7 +118,7 @@ class CaptureSummary:
     bits: int | None = None  # of the camera, if 16-bit files seem to have its values without scaling
 
     @property
-    def axis_angles_deg(self) -> Doubles:
+    def axis_angles_deg(self) -> Float64Array:
         """Angles (F,) between the lights and the camera axis."""
         return np.asarray(np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1))))
 

@@ -12,7 +12,7 @@ import numpy as np
 from splinecli.capture.formats.numbers import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
@@ -23,7 +23,7 @@ _REDRAWS = 1000
 _INDEX = re.compile(r"[0-9]{1,9}")
 
 
-def draw_lights(light_directions: Doubles, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
+def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
     """Return random draws of lights without replacement, each in ascending order.
 
     Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the same number of lights
@@ -70,7 +70,7 @@ class DrawsFile:
     def n_lights(self) -> int:
         return len(self.draws[0])
 
-    def check_against(self, light_directions: Doubles, *, skipped: int = 0) -> None:
+    def check_against(self, light_directions: Float64Array, *, skipped: int = 0) -> None:
         """Raise InputError, with the line number, for a draw that does not fit a capture under these lights (F, 3).
 
         Draws must not include the first `skipped` lights.
@@ -107,7 +107,7 @@ def read_draws(path: Path) -> DrawsFile:
     return DrawsFile(path, tuple(draws), tuple(lines))
 
 
-def _draw(light_directions: Doubles, n_lights: int, trial: int, seed: int) -> Draw:
+def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(_REDRAWS):
         # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the same in later NumPy

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths import Doubles, Floats
+from splinecli.maths import Float64Array, Floats
 
 SMALLEST_PIVOT = 1e-12
 """A usual limit of the pivots if the lights are unit vectors and the largest weight is about 1."""
@@ -102,7 +102,7 @@ def absolute_weights(residuals: Floats) -> Floats:
 
 def fit_robustly(
     values: Floats, lit: Floats, lights: Floats, fits: int, weights: Floats | None = None
-) -> tuple[Doubles, Doubles]:
+) -> tuple[Float64Array, Float64Array]:
     """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
 
     Args:
@@ -119,7 +119,7 @@ def fit_robustly(
     return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
 
 
-def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Doubles]:
+def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Float64Array]:
     """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
 
     Pixels below dark_share of the brightest hundredth are treated as dark, for example the background without a mask.

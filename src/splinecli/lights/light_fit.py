@@ -24,7 +24,7 @@ from splinecli.capture.record import Capture
 from splinecli.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECTED, CaptureWarning
 from splinecli.errors import UsageError
 from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
-from splinecli.maths import Doubles, Floats, Singles
+from splinecli.maths import Float32Array, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
@@ -46,8 +46,8 @@ class Factors:
 
     # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
     # matrices is one between images, as a share of the mean brightness
-    matrix: Doubles
-    image_residuals: Doubles  # (F,), RMS residual of each image after the fit of the factors, in this unit
+    matrix: Float64Array
+    image_residuals: Float64Array  # (F,), RMS residual of each image after the fit of the factors, in this unit
     intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
@@ -59,7 +59,7 @@ class Factors:
         """Return the factors of the same observations, to be compared with lights of any intensities."""
         return replace(self, intensities_known=False)
 
-    def misfits(self, light_directions: Doubles) -> Doubles:
+    def misfits(self, light_directions: Float64Array) -> Float64Array:
         """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
         if self.intensities_known:
             return self.distances(np.linalg.qr(light_directions)[0])
@@ -67,18 +67,18 @@ class Factors:
         differences = self.matrix.T - intensities[..., None] * matrices
         return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
 
-    def distances(self, bases: Doubles) -> Doubles:
+    def distances(self, bases: Float64Array) -> Float64Array:
         """Return the root mean square distances (N,) from the images that orthonormal bases (N, F, 3) can explain."""
         explained = ((self.matrix @ bases) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
 
-    def intensities(self, light_directions: Doubles) -> Doubles:
+    def intensities(self, light_directions: Float64Array) -> Float64Array:
         """Return the intensities (N, F) that fit lights (N, F, 3) best; ones if they are known."""
         if self.intensities_known:
             return np.ones(light_directions.shape[:2])
         return self._fit_intensities(light_directions)[0]
 
-    def _fit_intensities(self, light_directions: Doubles) -> tuple[Doubles, Doubles]:
+    def _fit_intensities(self, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
         # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
         prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
@@ -122,7 +122,7 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
     return Factors(scale @ matrix, residuals, intensities_known)
 
 
-def random_misfits(factors: Factors, light_directions: Doubles) -> Doubles:
+def random_misfits(factors: Factors, light_directions: Float64Array) -> Float64Array:
     """Return the residuals of the lights (F, 3) in random orders, in rising order."""
     # A given order is compared with so many random ones.
     given = np.tile(np.arange(len(light_directions)), (250, 1))
@@ -149,7 +149,7 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
     return orders
 
 
-def fit_residual(values: Doubles, light_directions: Doubles) -> float:
+def fit_residual(values: Float64Array, light_directions: Float64Array) -> float:
     """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3).
 
     It is a share of the mean of the lit values.
@@ -160,7 +160,7 @@ def fit_residual(values: Doubles, light_directions: Doubles) -> float:
     return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
 
 
-def sample_pixels(observations: Floats) -> Doubles:
+def sample_pixels(observations: Floats) -> Float64Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
     # Pixels below this share of the brightest hundredth are left out as background. The second share is used if the
@@ -168,7 +168,7 @@ def sample_pixels(observations: Floats) -> Doubles:
     for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
-        kept: Doubles = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+        kept: Float64Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
             break
     return kept
@@ -197,8 +197,8 @@ _FIRST_FITS, _FITS_PER_ROUND = 8, 2
 class LightFit(NamedTuple):
     """Lights that fit the images best near given ones."""
 
-    directions: Doubles  # (F, 3), unit
-    intensities: Doubles  # (F,), relative to the intensities by which the observations were divided
+    directions: Float64Array  # (F, 3), unit
+    intensities: Float64Array  # (F,), relative to the intensities by which the observations were divided
     # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
     # observation
     before: float
@@ -246,7 +246,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     )
 
 
-def would_refine(observations: Floats, factors: Factors | None, light_directions: Doubles) -> LightFit | None:
+def would_refine(observations: Floats, factors: Factors | None, light_directions: Float64Array) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
     It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the observations.
@@ -287,8 +287,8 @@ def check_light_error(error_deg: float | None, *, refines: bool) -> None:
 
 
 def refine_lights(
-    observations: Singles,
-    light_directions: Doubles,
+    observations: Float32Array,
+    light_directions: Float64Array,
     *,
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
@@ -313,9 +313,9 @@ def refine_lights(
 
 
 def fit_near(
-    observations: Singles,
-    light_directions: Doubles,
-    error_deg: float | Doubles,
+    observations: Float32Array,
+    light_directions: Float64Array,
+    error_deg: float | Float64Array,
     *,
     intensity_error: float,
     worth_pixels: float,
@@ -351,7 +351,7 @@ def fit_near(
     return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
 
 
-def _choose_pixels(observations: Singles) -> Doubles | None:
+def _choose_pixels(observations: Float32Array) -> Float64Array | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
     if observations.shape[1] < MIN_LIGHTS:
         return None
@@ -359,11 +359,11 @@ def _choose_pixels(observations: Singles) -> Doubles | None:
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 
-def _misfit(values: Doubles, normals: Doubles, lights: Doubles, lit: Doubles) -> float:
+def _misfit(values: Float64Array, normals: Float64Array, lights: Float64Array, lit: Float64Array) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
 
 
-def _prior(light_directions: Doubles, error_deg: float | Doubles, intensity_error: float) -> Doubles:
+def _prior(light_directions: Float64Array, error_deg: float | Float64Array, intensity_error: float) -> Float64Array:
     """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
     along = light_directions[:, :, None] * light_directions[:, None, :]
     # The angle has two components, each with half of its variance.
@@ -372,14 +372,14 @@ def _prior(light_directions: Doubles, error_deg: float | Doubles, intensity_erro
 
 
 def _move_lights(
-    values: Doubles,
-    normals: Doubles,
-    weights: Doubles,
-    lights: Doubles,
-    given: Doubles,
-    precision: Doubles,
+    values: Float64Array,
+    normals: Float64Array,
+    weights: Float64Array,
+    lights: Float64Array,
+    given: Float64Array,
+    precision: Float64Array,
     worth_pixels: float,
-) -> Doubles:
+) -> Float64Array:
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splinecli.fits.robust import fit_robustly, shadow_weights
-from splinecli.maths import Bools, Doubles, Floats
+from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
@@ -32,9 +32,11 @@ _TURNED_PIXELS = 2000
 class RoughNormals:
     """Normals on a grid of pixels."""
 
-    normals: Doubles  # (h, w, 3), unit in the mask, zero outside
+    normals: Float64Array  # (h, w, 3), unit in the mask, zero outside
     mask: Bools  # (h, w)
-    outward: Doubles  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
+    outward: (
+        Float64Array  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
+    )
 
     @property
     def rim_steepness(self) -> float:
@@ -42,7 +44,7 @@ class RoughNormals:
         rim = self.outward.any(axis=2)
         return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
 
-    def transformed(self, matrix: Doubles) -> RoughNormals:
+    def transformed(self, matrix: Float64Array) -> RoughNormals:
         """Return the normals that the lights would give after a multiplication with a matrix (3, 3)."""
         normals = self.normals @ np.linalg.inv(matrix)
         return RoughNormals(np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward)
@@ -71,7 +73,7 @@ class RoughNormals:
         curls = np.cos(angles) * (p_y - q_x)[::step] - np.sin(angles) * (p_x + q_y)[::step]
         return float(np.median(np.abs(curls), axis=1).argmin() - 90)
 
-    def _derivatives_inside(self) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]] | None:
+    def _derivatives_inside(self) -> tuple[tuple[Float64Array, Float64Array], tuple[Float64Array, Float64Array]] | None:
         """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None for too few."""
         from scipy.ndimage import binary_erosion
 
@@ -94,7 +96,7 @@ class RoughNormals:
         return float((along * self.outward[steep]).sum(axis=1).mean())
 
 
-def rough_normals(observations: Floats, light_directions: Doubles, mask: Bools) -> RoughNormals:
+def rough_normals(observations: Floats, light_directions: Float64Array, mask: Bools) -> RoughNormals:
     """Return smoothed normals of a fit of least absolute deviations.
 
     Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
@@ -105,7 +107,7 @@ def rough_normals(observations: Floats, light_directions: Doubles, mask: Bools) 
 
 
 def median_turn_deg(
-    observations: Floats, lights: Doubles, other_lights: Doubles, other_observations: Floats | None = None
+    observations: Floats, lights: Float64Array, other_lights: Float64Array, other_observations: Floats | None = None
 ) -> float:
     """Return the median angle in degrees between the normals that two readings of a capture give.
 
@@ -137,7 +139,7 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
     return RoughNormals(smooth, mask, _outward(mask))
 
 
-def _outward(mask: Bools) -> Doubles:
+def _outward(mask: Bools) -> Float64Array:
     """Return unit vectors (h, w, 2) out of the mask at its rim, leaving out the border of the image."""
     from scipy.ndimage import distance_transform_edt
 
@@ -149,14 +151,14 @@ def _outward(mask: Bools) -> Doubles:
     return np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
 
 
-def outward_directions(mask: Bools, sigma: float) -> Doubles:
+def outward_directions(mask: Bools, sigma: float) -> Float64Array:
     """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels falls; else zero."""
     from scipy.ndimage import gaussian_filter
 
     return unit(-np.stack(_derivatives(gaussian_filter(mask.astype(np.float64), sigma)), axis=2))
 
 
-def _derivatives(values: Doubles) -> tuple[Doubles, Doubles]:
+def _derivatives(values: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the derivatives to the right and upwards; zero along a side of one pixel."""
     downwards, right = (
         np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)
@@ -205,12 +207,12 @@ class ShadowCheck:
     """Dark observations of a sample, to be compared with the shadows of its surfaces under its lights."""
 
     normals: RoughNormals  # on a coarser grid
-    lights: Doubles  # (f, 3)
+    lights: Float64Array  # (f, 3)
     lit: Bools  # (p, f), whether a matte pixel would be bright
     dark: Bools  # (p, f), whether it is dark nevertheless
 
     @classmethod
-    def of(cls, observations: Floats, lights: Doubles, normals: RoughNormals) -> ShadowCheck:
+    def of(cls, observations: Floats, lights: Float64Array, normals: RoughNormals) -> ShadowCheck:
         """Return the check of observations (P, F) under lights (F, 3), with the smoothed normals that these give."""
         step = max(1, int(np.ceil(np.sqrt(len(observations) / _MAX_PIXELS))))
         part = slice(None, None, step), slice(None, None, step)
@@ -224,7 +226,7 @@ class ShadowCheck:
         lit = shading > _LIT_SHARE * shading.max(axis=1, keepdims=True).clip(min=1e-12)
         return cls(coarse, lights[chosen], lit, lit & (values[:, chosen] < _DARK_SHARE * shading))
 
-    def shadows(self, matrix: Doubles) -> Shadows:
+    def shadows(self, matrix: Float64Array) -> Shadows:
         """Return the shadows under the lights after a multiplication with a matrix (3, 3)."""
         from splinecli.surface.integration import integrate_normals
 
@@ -242,7 +244,7 @@ class ShadowCheck:
         return Shadows(agreement, float((cast & ~dark).mean()))
 
 
-def cast_shadows(heights: Doubles, lights: Doubles) -> Bools:
+def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
     """Return where a surface shades itself (h, w, F), from heights (h, w) in pixels, NaN outside the object."""
     height, width = heights.shape
     relief = float(np.nanmax(heights) - np.nanmin(heights))

@@ -28,7 +28,7 @@ from splinecli.errors import InputError
 from splinecli.fits.robust import fit_robustly, lit_values, shadow_weights
 from splinecli.lights.light_fit import INTENSITY_ERROR, fit_near
 from splinecli.lights.rough_normals import cast_shadows, outward_directions, smooth_normals
-from splinecli.maths import Bools, Doubles, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
 from splinecli.networks.weights import light_net
@@ -49,7 +49,7 @@ _LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)  # logarithms of the factors of the he
 _ALBEDO_BIN, _ALBEDO_BINS = 0.1, 41  # of the logarithm of the albedo
 
 
-def bump_log_odds(observations: Singles, mask: Bools, light_directions: Doubles) -> float:
+def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> float:
     """Return the log odds that the lights are right against that their x and y are negated.
 
     Args:
@@ -89,7 +89,7 @@ def _correlation(predicted: Bools, seen: Bools) -> float:
     return float(np.corrcoef(predicted, seen)[0, 1])
 
 
-def lower_lights(observations: Singles, light_directions: Doubles, error_deg: float) -> Doubles:
+def lower_lights(observations: Float32Array, light_directions: Float64Array, error_deg: float) -> Float64Array:
     """Return low lights (F, 3), lowered together towards those under which the albedo has few values; others as given.
 
     The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity
@@ -115,7 +115,7 @@ def lower_lights(observations: Singles, light_directions: Doubles, error_deg: fl
     return np.asarray(unit(light_directions * (1, 1, np.exp(_LOG_HEIGHTS[int(np.argmin(costs))]))))
 
 
-def _entropy(scaled_normals: Doubles) -> float:
+def _entropy(scaled_normals: Float64Array) -> float:
     """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their median."""
     albedo = np.log(np.linalg.norm(scaled_normals, axis=1))
     places = np.rint((albedo - np.median(albedo)) / _ALBEDO_BIN) + _ALBEDO_BINS // 2

@@ -9,5 +9,5 @@ Array = NDArray[Any]
 Bools = NDArray[np.bool_]
 Integers = NDArray[np.integer]
 Floats = NDArray[np.floating]  # of any precision
-Singles = NDArray[np.float32]
-Doubles = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
-from splinecli.maths import Doubles
+from splinecli.maths import Float64Array
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
@@ -127,7 +127,7 @@ def _curve(tag: bytes) -> TransferCurve:
     return tuple(linear.clip(0, 1).tolist())
 
 
-def _parametric(stored: Doubles, given: list[float]) -> Doubles:
+def _parametric(stored: Float64Array, given: list[float]) -> Float64Array:
     """Return the linear values of a parametric curve with 3, 4, 5 or 7 parameters, in the order of the standard."""
     g, a, b = given[:3]
     if a <= 0:

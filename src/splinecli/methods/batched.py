@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
-from splinecli.lights.lamp_light import LampLight, LightOf, Rows
+from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
 from splinecli.methods.estimator import (
     TOWARDS_CAMERA,
@@ -159,14 +159,14 @@ class NetworkEstimator(Estimator):
         self._contexts: list[CaptureContext | None] = [None] * rotations  # the capture's context in each rotation
 
     @torch.no_grad()
-    def bind(self, light_of: LightOf, n_pixels: int) -> NetworkEstimator:
+    def bind(self, lighting_at: LightingAt, n_pixels: int) -> NetworkEstimator:
         """Return this estimator with the context of one capture, from a sample of its pixels; see Estimator.
 
         Without it, each call of `estimate` treats its pixels as a capture of their own.
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self
-        light = light_of(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
+        light = lighting_at(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
         pixels = sample_of(light.observations)
         sample, lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
@@ -194,10 +194,10 @@ class NetworkEstimator(Estimator):
         """
         if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
 
-            def light_of(pixels: Rows) -> LampLight:
-                return LampLight(observations[pixels], directions_at(light_directions, pixels))
+            def lighting_at(pixels: PixelIndices) -> PixelLighting:
+                return PixelLighting(observations[pixels], directions_at(light_directions, pixels))
 
-            alone = self.bind(light_of, len(observations))
+            alone = self.bind(lighting_at, len(observations))
             return alone.estimate_with_error(observations, light_directions, progress=progress)
         results = estimate_in_batches(
             self._average_rotations,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from splinecli.errors import UsageError
 from splinecli.fits.least_squares import weighted_least_squares
-from splinecli.lights.lamp_light import LightOf
+from splinecli.lights.lighting import LightingAt
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import map_scale
 from splinecli.methods.estimator import (
@@ -247,11 +247,11 @@ class DistilledEstimator(Estimator):
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
-    def rebind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+    def rebind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
         """Learn the capture again after its observations changed. Return the network if it cannot be learned."""
-        teacher = self._teacher.bind(light_of, n_pixels)
+        teacher = self._teacher.bind(lighting_at, n_pixels)
         try:
-            learned = distil(teacher, light_of, n_pixels, self._size)
+            learned = distil(teacher, lighting_at, n_pixels, self._size)
         except UsageError:  # too few pixels are still lit
             return teacher
         return learned if learned.distillation.is_good else teacher
@@ -306,7 +306,7 @@ class DistilledEstimator(Estimator):
 
 def distil(
     teacher: Estimator,
-    light_of: LightOf,
+    lighting_at: LightingAt,
     n_pixels: int,
     size: StudentSize,
     *,
@@ -319,14 +319,14 @@ def distil(
 
     Args:
         teacher: has confidence, and is bound to the capture.
-        light_of, n_pixels: see Estimator.bind.
+        lighting_at, n_pixels: see Estimator.bind.
         progress: called with numbers of pixels; in all, twice the pixels of the sample.
 
     Raises:
         UsageError: too few pixels are lit for a sample of FEWEST_PIXELS.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    light = light_of(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
+    light = lighting_at(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
     lit = np.flatnonzero((light.observations > 0).any(axis=1))
     candidates = light.observations[lit]
     directions = directions_at(light.directions, lit)

@@ -19,7 +19,7 @@ from splinecli.maths.normals import unit
 from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
-    from splinecli.lights.lamp_light import LightOf
+    from splinecli.lights.lighting import LightingAt
     from splinecli.maths.observation_map import Grid
     from splinecli.refinement.refiner import NetworkRefiner
 
@@ -107,18 +107,18 @@ class Estimator(ABC):
         """
         return self.estimate(observations, light_directions, progress=progress), None
 
-    def bind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+    def bind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
         """Return the estimator for the pixels of one capture, possibly with an encoded sample as context.
 
         Args:
-            light_of: gives the observations and the light directions of some pixels.
+            lighting_at: gives the observations and the light directions of some pixels.
             n_pixels: of the capture.
         """
         return self
 
-    def rebind(self, light_of: LightOf, n_pixels: int) -> Estimator:
+    def rebind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
         """Return the estimator, made by `bind`, for the same capture with other observations."""
-        return self.bind(light_of, n_pixels)
+        return self.bind(lighting_at, n_pixels)
 
     def observation_maps(
         self,

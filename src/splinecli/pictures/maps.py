@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.maths import Bools, Floats, Singles
+from splinecli.maths import Bools, Float32Array, Floats
 from splinecli.maths.normals import encode_picture, unit
 from splinecli.maths.transfer import encode_srgb
 
@@ -53,7 +53,7 @@ TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) fo
 TITLE = "angular error (deg)"
 
 
-def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
+def albedo_picture(albedo: Float32Array, mask: Bools) -> Picture:
     """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the pixels are white.
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
@@ -63,12 +63,12 @@ def albedo_picture(albedo: Singles, mask: Bools) -> Picture:
     return encode_srgb(albedo / white)
 
 
-def confidence_picture(confidence_map: Singles, _: Bools | None = None) -> Picture:
+def confidence_picture(confidence_map: Float32Array, _: Bools | None = None) -> Picture:
     """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
     return np.rint(255 * confidence_map).astype(np.uint8)
 
 
-def preview_picture(normal_map: Singles, mask: Bools) -> Picture:
+def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
     """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
 
     It is black outside the mask (H, W).
@@ -77,7 +77,7 @@ def preview_picture(normal_map: Singles, mask: Bools) -> Picture:
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-def signed_picture(values: Singles, _: Bools, scale: float) -> Picture:
+def signed_picture(values: Float32Array, _: Bools, scale: float) -> Picture:
     """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale black, scale white."""
     first = values if values.ndim == 2 else values[..., 0]
     share = np.nan_to_num(first / scale).clip(-1, 1)

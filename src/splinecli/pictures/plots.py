@@ -11,7 +11,7 @@ import numpy as np
 
 from splinecli.capture.formats.images import read_image
 from splinecli.errors import printable
-from splinecli.maths import Bools, Doubles, Floats, Integers
+from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import encode_picture, unit
 from splinecli.methods import method_names
 from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, Picture, bounding_box, colour_errors
@@ -60,7 +60,7 @@ def png_bytes(figure: Figure, dpi: int) -> bytes:
 _RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
 
 
-def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | None = None) -> bytes:
+def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64Array | None = None) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
     The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle of this radius is
@@ -87,7 +87,7 @@ def sky_plot(light_directions: Doubles, title: str, *, errors_deg: Doubles | Non
     return png_bytes(figure, 120)
 
 
-def _circles(directions: Doubles, radii: Doubles, angle: Doubles) -> Doubles:
+def _circles(directions: Float64Array, radii: Float64Array, angle: Float64Array) -> Float64Array:
     """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
     across = unit(np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)]))
     turned = np.cross(directions, across)

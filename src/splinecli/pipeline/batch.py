@@ -41,7 +41,7 @@ from splinecli.system.publishing import held_folder, is_plain
 
 
 @dataclass(frozen=True)
-class Member:
+class BatchItem:
     """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not exist."""
 
     folder: Path
@@ -49,7 +49,7 @@ class Member:
     missing: InputError | None = None
 
 
-def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
+def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[BatchItem]:
     """Return the captures in the order given, without duplicate folders.
 
     Raises UsageError if images are given instead of their folder, two captures have the same name, or a "folder" that
@@ -65,7 +65,7 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
         # machines of a cluster.
         chosen = set(sorted(folders, key=os.fsencode)[shard.number - 1 :: shard.n_parts])
     # Include the captures of the other shards, because their results go to the same place.
-    members = {folder: _member(folder) for folder in folders}
+    members = {folder: _batch_item(folder) for folder in folders}
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
@@ -84,7 +84,7 @@ def _own_path(folder: Path) -> Path:
         return folder  # the error is reported when this capture is processed
 
 
-def _member(folder: Path) -> Member:
+def _batch_item(folder: Path) -> BatchItem:
     """Return the capture in the folder. Raises UsageError for a value that belongs to another option."""
     # If a folder cannot be read, the error is reported when that capture is processed.
     try:
@@ -93,15 +93,15 @@ def _member(folder: Path) -> Member:
         exists = True
     if exists:
         try:
-            return Member(folder, capture_name(folder))
+            return BatchItem(folder, capture_name(folder))
         except InputError:
-            return Member(folder, folder.name)
+            return BatchItem(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
         raise UsageError(
             "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
         )
     kind = "film" if is_film(folder) else "folder"
-    return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
+    return BatchItem(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
 
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
@@ -120,7 +120,7 @@ class Outcome:
 
 
 def run_member(
-    member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
+    member: BatchItem, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
 ) -> Outcome:
     """Compute one capture of a batch, unless its results are up to date or must be kept.
 
@@ -149,7 +149,7 @@ def run_member(
         return _failure(member, error)
 
 
-def _failure(member: Member, error: Exception) -> Outcome:
+def _failure(member: BatchItem, error: Exception) -> Outcome:
     """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would fail, too."""
     trace = ""
     if is_out_of_memory(error):
@@ -281,7 +281,7 @@ def infer_batch(
 
 
 def _on_workers(
-    members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
+    members: Sequence[BatchItem], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it finishes in another process."""
     # Accept any device, because the workers may have GPUs that the command's machine does not have.
@@ -322,7 +322,7 @@ class _Warnings(Observer):
 
 
 def _infer(
-    options: InferOptions, redo: Redo, sha256: str | None, number: int, member: Member
+    options: InferOptions, redo: Redo, sha256: str | None, number: int, member: BatchItem
 ) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return its outcome and the warnings."""
     options.check_files()
@@ -354,13 +354,13 @@ def worst_exit_code(codes: Iterable[int]) -> int:
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
 
-def expected_bytes(member: Member, options: InferOptions) -> float:
+def expected_bytes(member: BatchItem, options: InferOptions) -> float:
     """Return the approximate memory in bytes that `infer` needs for a capture. See source_bytes."""
     n_lights = options.n_lights or len(options.light_indices or ())
     return source_bytes(lambda: options.open(member.folder), n_lights)
 
 
-def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
+def choose_workers(members: Sequence[BatchItem], options: InferOptions) -> int:
     """Return the number of captures that this machine can compute in parallel, given its cores and its memory.
 
     A GPU computes one capture at a time.

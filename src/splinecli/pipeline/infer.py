@@ -26,7 +26,7 @@ from splinecli.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LI
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
-from splinecli.inference import NormalEstimate, estimate_normals, find_surface, light_on
+from splinecli.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.lights.light_fit import refine_capture
 from splinecli.methods import Estimator, make_estimator
 from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
@@ -107,14 +107,14 @@ def distil_for(
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
-    light_of = partial(light_on(capture), None)
-    teacher = estimator.bind(light_of, capture.n_pixels)
+    lighting_at = partial(lighting_on(capture), None)
+    teacher = estimator.bind(lighting_at, capture.n_pixels)
     from splinecli.methods.distilled import distil
 
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(teacher, light_of, capture.n_pixels, size, progress=advance)
+                distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
             return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:

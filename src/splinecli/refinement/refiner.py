@@ -16,13 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.fits.least_squares import alternating_signs
-from splinecli.lights.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
 from splinecli.maths.observation_map import map_scale
 from splinecli.networks.refine_net import CHANNELS, COARSEST, Part, RefineNet, channels, unit_maps
-from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
+from splinecli.refinement.detail import FEWEST_LIGHTS, HalfCapture, restore_detail, restore_octave
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
-from splinecli.refinement.halving import HalfCapture
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
@@ -53,7 +52,7 @@ class _Capture:
 
     mask: NDArray[np.bool_]  # (H, W), with P true pixels
     observations: Floats  # (P, F)
-    light_of: LightOf  # gives the light of some pixels
+    lighting_at: LightingAt  # gives the light of some pixels
     normals: Floats  # (P, 3), replaced, as are the errors (P, 2)
     errors: Floats
     reference: float  # reference, signs: of the whole capture; see refine_features
@@ -90,7 +89,7 @@ class NetworkRefiner:
         self,
         mask: NDArray[np.bool_],
         observations: Floats,
-        light_of: LightOf,
+        lighting_at: LightingAt,
         normals: Floats,
         errors: Floats,
         *,
@@ -103,32 +102,32 @@ class NetworkRefiner:
         Args:
             mask: (H, W), with P true pixels.
             observations: (P, F); only their brightness is used here.
-            light_of: gives the observations and the light directions of some pixels.
+            lighting_at: gives the observations and the light directions of some pixels.
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
         """
-        middle = light_of(np.array([len(normals) // 2])).directions  # the lights at one pixel
+        middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
         of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
-        self._refine(_Capture(around_object(mask), observations, light_of, normals, errors, *of_whole), progress)
+        self._refine(_Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole), progress)
 
     def _refine(self, capture: _Capture, progress: Progress | None = None) -> None:
         half, turns, margin, whole = None, self.turns, self.margin, (capture.normals, capture.errors)
         if len(capture.normals) > self.most_pixels:
             turns = 1
             if len(capture.signs) >= FEWEST_LIGHTS:
-                half = HalfCapture.of(capture.mask, capture.light_of, *whole, capture.reference)
-                margin, of_half = _DETAIL_MARGIN, (half.observations, half.light_of, half.normals, half.errors)
+                half = HalfCapture.of(capture.mask, capture.lighting_at, *whole, capture.reference)
+                margin, of_half = _DETAIL_MARGIN, (half.observations, half.lighting_at, half.normals, half.errors)
                 self._refine(_Capture(around_object(half.mask), *of_half, capture.reference, capture.signs))
         lit = capture.observations.max(axis=1) > 0
         above = Band(slice(0, 0), *whole)
 
-        def refine(tile: Tile) -> tuple[Rows, Floats, Floats]:
+        def refine(tile: Tile) -> tuple[PixelIndices, Floats, Floats]:
             inside = tile.mask[tile.inner]
             own = tile.rows[tile.inner][inside]
             seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
             maps = self._see(capture, tile, seen, turns) if half is None else self._enlarge(capture, tile, seen, half)
             refined, errors = (values[:, *inner].permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
-            _turn_back(refined, own, capture.light_of)
+            _turn_back(refined, own, capture.lighting_at)
             return own, refined, errors
 
         # The net's layers are large enough for all cores.
@@ -150,7 +149,7 @@ class NetworkRefiner:
     def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
         """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged over rotations."""
 
-        def features_of(rows: Rows, light: LampLight, _: slice) -> torch.Tensor:
+        def features_of(rows: PixelIndices, light: PixelLighting, _: slice) -> torch.Tensor:
             return refine_features(
                 self._tensor(light.observations),
                 self._tensor(light.directions),
@@ -160,7 +159,7 @@ class NetworkRefiner:
                 capture.signs,
             )
 
-        features = self._maps(tile, CHANNELS, capture.light_of, features_of)
+        features = self._maps(tile, CHANNELS, capture.lighting_at, features_of)
         mask = self._tensor(tile.mask)[None]
         normals, errors = self._average_turns(features, mask, seen, turns)
         if len(capture.signs) >= FEWEST_LIGHTS:
@@ -176,7 +175,7 @@ class NetworkRefiner:
         inside = smooth[:, torch.from_numpy(tile.mask)].T.numpy()
         errors = errors[:, *seen].to(self._device)
 
-        def values_of(rows: Rows, light: LampLight, part: slice) -> torch.Tensor:
+        def values_of(rows: PixelIndices, light: PixelLighting, part: slice) -> torch.Tensor:
             normals = (light.in_frame_of_pixels(values) for values in (inside[part], capture.normals[rows]))
             observations, directions = map(self._tensor, (light.observations, light.directions))
             scale = map_scale(observations)
@@ -184,13 +183,17 @@ class NetworkRefiner:
             values = (fit.normals, fit.noise.clamp(-1, 1), scale / capture.reference)
             return torch.cat((*map(self._tensor, normals), *values), dim=1)
 
-        maps = self._maps(tile, 11, capture.light_of, values_of)[:, *seen]
+        maps = self._maps(tile, 11, capture.lighting_at, values_of)[:, *seen]
         smooth, estimated, least_squares, noise, largest = torch.split(maps, [3, 3, 3, 1, 1])
         mask = self._tensor(tile.mask)[None, *seen]
         return restore_octave(unit_maps(smooth), estimated, least_squares, noise, largest, mask), errors
 
     def _maps(
-        self, tile: Tile, columns: int, light_of: LightOf, values_of: Callable[[Rows, LampLight, slice], torch.Tensor]
+        self,
+        tile: Tile,
+        columns: int,
+        lighting_at: LightingAt,
+        values_of: Callable[[PixelIndices, PixelLighting, slice], torch.Tensor],
     ) -> torch.Tensor:
         """Return maps (columns, h, w), zero outside the mask, of a tile's values (N, columns).
 
@@ -200,7 +203,7 @@ class NetworkRefiner:
         rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
         for start in range(0, len(rows), LIT_AT_ONCE):
             part = slice(start, start + LIT_AT_ONCE)
-            maps.view(-1, columns)[places[part]] = values_of(rows[part], light_of(rows[part]), part)
+            maps.view(-1, columns)[places[part]] = values_of(rows[part], lighting_at(rows[part]), part)
         return maps.permute(2, 0, 1)
 
     def _average_turns(self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int) -> Maps:
@@ -223,11 +226,11 @@ class NetworkRefiner:
         return torch.as_tensor(values, dtype=torch.float32, device=self._device)
 
 
-def _turn_back(normals: Floats, rows: Rows, light_of: LightOf) -> None:
+def _turn_back(normals: Floats, rows: PixelIndices, lighting_at: LightingAt) -> None:
     """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
     for start in range(0, len(rows), LIT_AT_ONCE):
         part = slice(start, start + LIT_AT_ONCE)
-        light = light_of(rows[part])
+        light = lighting_at(rows[part])
         if light.turns is None:
             break
         normals[part] = light.in_frame_of_capture(normals[part])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from splinecli.capture_warnings import WHITE_LEVEL, CaptureWarning
 from splinecli.errors import InputError, UsageError
 from splinecli.fits.robust import absolute_weights, fit_scaled_normals, shade, shadow_weights
-from splinecli.maths import Array, Bools, Doubles, Integers, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 
 ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 
@@ -33,7 +33,7 @@ MAX_BRIGHTENING = 8.0  # no observation is restored to more than this many times
 
 _TILE_PIXELS = 8192
 
-LightsOf = Callable[[Integers], Doubles]
+LightsOf = Callable[[Integers], Float64Array]
 """From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
 pixel shows."""
 
@@ -50,7 +50,7 @@ def in_any_channel(flags: Bools) -> Bools:
     return np.asarray(reduce(np.logical_or, flags.T))
 
 
-def restore_saturated(observations: Singles, saturated: Bools, lights: Doubles | LightsOf) -> Bools | None:
+def restore_saturated(observations: Float32Array, saturated: Bools, lights: Float64Array | LightsOf) -> Bools | None:
     """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
 
     A saturated observation was at least as bright as stored. Its estimate is the prediction of a robust Lambertian fit
@@ -72,7 +72,7 @@ def restore_saturated(observations: Singles, saturated: Bools, lights: Doubles |
     return saturated & ~everywhere[:, None] if len(rows) else None
 
 
-def _restored(stored: Singles, saturated: Bools, lights: Singles) -> Singles:
+def _restored(stored: Float32Array, saturated: Bools, lights: Float32Array) -> Float32Array:
     scale = stored.max(axis=1, keepdims=True)
     scale[scale <= 0] = 1
     values = lowest = stored / scale
@@ -311,14 +311,14 @@ def surrounds_hole(mask: Bools) -> bool:
     return bool(border.mean() >= LEAST_BORDER and LEAST_HOLE <= 1 - mask.mean() < 1)
 
 
-def looks_inverted(mask: Bools, brightness: Singles) -> bool:
+def looks_inverted(mask: Bools, brightness: Float32Array) -> bool:
     """Return whether a mask (H, W) surrounds a hole that is not dark in the picture's brightness (H, W)."""
     if not surrounds_hole(mask):
         return False
     return bool(np.median(brightness[~mask]) > LEAST_BRIGHT * np.median(brightness[mask]))
 
 
-def find_object(brightness: Singles) -> Bools:
+def find_object(brightness: Float32Array) -> Bools:
     """Return the mask (H, W) of an object before a darker background.
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from splinecli import capture_warnings as codes
 from splinecli.capture_warnings import CaptureWarning
 from splinecli.fits.robust import fit_robustly, lit_values, shade, shadow_weights
-from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import spread_of, unit
 
-Lights = Doubles | Callable[[Integers], Doubles]
+Lights = Float64Array | Callable[[Integers], Float64Array]
 
 MIN_LIGHTS = 6
 """Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
@@ -56,7 +56,9 @@ _STEP = 1.5  # exponent of each round's change; beyond 1 it saves a third of the
 _CONVERGED = 1e-4  # change of the logarithms
 
 
-def estimate_light_intensities(observations: Singles, missing: Bools | None, lights: Lights) -> Doubles | None:
+def estimate_light_intensities(
+    observations: Float32Array, missing: Bools | None, lights: Lights
+) -> Float64Array | None:
     """Return light intensities (F,) with a mean of 1, or None if equal ones fit or the images do not determine them.
 
     Args:
@@ -84,7 +86,9 @@ def estimate_light_intensities(observations: Singles, missing: Bools | None, lig
     return intensities if error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR) else None
 
 
-def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArray[np.intp], Doubles, Bools] | None:
+def _choose_pixels(
+    observations: Float32Array, missing: Bools | None
+) -> tuple[NDArray[np.intp], Float64Array, Bools] | None:
     """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them to use.
 
     Returns None for too few.
@@ -98,7 +102,7 @@ def _choose_pixels(observations: Singles, missing: Bools | None) -> tuple[NDArra
     return (chosen[enough], values[enough], known[enough]) if enough.sum() >= _MIN_PIXELS else None
 
 
-def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None:
+def _alternate(values: Float64Array, known: Bools, lights: Float64Array) -> Float64Array | None:
     """Return the intensities (F,) at which fits and medians agree; None if a light reaches too few pixels."""
     intensities = np.ones(values.shape[1])
     for _ in range(_MAX_ROUNDS):
@@ -108,7 +112,7 @@ def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None
         if (counts.sum(axis=0) < 10).any():
             return None
         ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
-        medians: Doubles = np.nanmedian(ratios, axis=0)
+        medians: Float64Array = np.nanmedian(ratios, axis=0)
         if not (medians > 0).all():
             return None
         before, intensities = intensities, intensities * (medians / intensities) ** _STEP
@@ -119,7 +123,7 @@ def _alternate(values: Doubles, known: Bools, lights: Doubles) -> Doubles | None
     return intensities
 
 
-def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> Doubles:
+def _likeliest_tilt(intensities: Float64Array, normals: Float64Array, lights: Float64Array) -> Float64Array:
     """Return the intensities (F,) that explain the same images of a flat object with its likeliest tilt.
 
     Under a tilt t, a plane that shows k_f needs intensities k_f / l_f . (t, 1). The likeliest tilt leaves intensities
@@ -135,13 +139,13 @@ def _likeliest_tilt(intensities: Doubles, normals: Doubles, lights: Doubles) -> 
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 
-def _shown(intensities: Doubles, normals: Doubles, lights: Doubles) -> tuple[Doubles, Doubles]:
+def _shown(intensities: Float64Array, normals: Float64Array, lights: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return unit directions (F, 3), and the brightness (F,) of a plane with the mean normal under each light."""
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
     return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
 
-def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -> bool:
+def _equal_are_better(intensities: Float64Array, normals: Float64Array, lights: Float64Array) -> bool:
     """Return whether a flat object is nearer to its tilt under equal intensities than to the likeliest tilt."""
     if spread_of(normals) >= FLAT_SPREAD:
         return False
@@ -152,18 +156,18 @@ def _equal_are_better(intensities: Doubles, normals: Doubles, lights: Doubles) -
     return bool(error < 2 * (_TRUSTED_TILTS * TILT) ** 2)
 
 
-def _variance(shown: Doubles, directions: Doubles, tilt: Doubles) -> float:
+def _variance(shown: Float64Array, directions: Float64Array, tilt: Float64Array) -> float:
     """Return the variance of the log intensities that a tilt does not explain."""
     return float((_inequality(shown, directions, tilt) ** 2).sum()) / max(len(shown) - 3, 1)
 
 
-def _inequality(shown: Doubles, directions: Doubles, tilt: Doubles) -> Doubles:
+def _inequality(shown: Float64Array, directions: Float64Array, tilt: Float64Array) -> Float64Array:
     """Return the log intensities (F,), mean 0, that give a plane with this tilt the observed brightness."""
     unequal = np.log(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
     return np.asarray(unequal - unequal.mean())
 
 
-def _fit_tilt(shown: Doubles, directions: Doubles, variance: float) -> Doubles:
+def _fit_tilt(shown: Float64Array, directions: Float64Array, variance: float) -> Float64Array:
     """Return the likeliest tilt (2,) of a plane, for log intensities of this variance and tilts of variance TILT^2."""
     tilt, certainty = np.zeros(2), TILT**2 / variance
     for _ in range(_TILT_FITS):
@@ -174,7 +178,7 @@ def _fit_tilt(shown: Doubles, directions: Doubles, variance: float) -> Doubles:
     return tilt
 
 
-def _fit(values: Doubles, known: Bools, intensities: Doubles, lights: Doubles) -> Doubles:
+def _fit(values: Float64Array, known: Bools, intensities: Float64Array, lights: Float64Array) -> Float64Array:
     """Return the scaled normals (p, 3) of matte pixels with these observations, for lights (F, 3) or (p, F, 3)."""
     observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
@@ -183,7 +187,7 @@ def _fit(values: Doubles, known: Bools, intensities: Doubles, lights: Doubles) -
     return np.asarray(normals * largest)
 
 
-def _error(observed: Doubles, predicted: Floats, known: Bools) -> float:
+def _error(observed: Float64Array, predicted: Floats, known: Bools) -> float:
     """Return the median of |observed - predicted|, as a share of each pixel's brightest prediction."""
     shares = np.abs(observed - predicted) / np.maximum(predicted.max(axis=1, keepdims=True), 1e-12)
     return float(np.median(shares[known]))
@@ -206,7 +210,7 @@ _DARK_COLOUR_SHARE = 0.15  # of the brightest hundredth of the sample, in every 
 _MIN_COLOUR_PIXELS = 50
 
 
-def lamp_colours(colours: Floats) -> tuple[Doubles | None, list[CaptureWarning]]:
+def lamp_colours(colours: Floats) -> tuple[Float64Array | None, list[CaptureWarning]]:
     """Return the colours (F, 3) of lamps, by which channels are to be divided, or None for equal ones; and warnings.
 
     Args:

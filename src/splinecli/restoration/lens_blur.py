@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths import Bools, Doubles, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array
 
 REACH = 6
 """Pixels around the object that the filter mixes with it, and half of the filter's side minus one."""
@@ -57,7 +57,7 @@ def _grown(mask: Bools, reach: int) -> Bools:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
 
 
-def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | None:
+def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float | None:
     """Sharpen observations in place; return the estimated blur, or None if it is negligible.
 
     Args:
@@ -91,7 +91,7 @@ def remove_blur(observations: Singles, mask: Bools, around: Bools) -> float | No
     return sigma
 
 
-def polynomial(numbers: Doubles, means: Doubles, deviations: Doubles) -> Doubles:
+def polynomial(numbers: Float64Array, means: Float64Array, deviations: Float64Array) -> Float64Array:
     """Return 1, the standardised numbers (..., N) and their products, (..., (N + 1)(N + 2) / 2)."""
     standard = ((numbers - means) / deviations).clip(-3, 3)
     with_one = np.concatenate((np.ones_like(standard[..., :1]), standard), axis=-1)
@@ -111,7 +111,7 @@ def _widest_at(correlation: float) -> float:
     return float(np.interp(correlation + _CORRELATION_ERROR, of_gradients, sigmas))
 
 
-def inverse_filter(sigma: float) -> Singles:
+def inverse_filter(sigma: float) -> Float32Array:
     """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
 
     Of all filters of this size it has the least mean square error (Wiener's criterion) for white noise and images whose
@@ -131,7 +131,7 @@ def inverse_filter(sigma: float) -> Singles:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-def edge_numbers(observations: Singles, mask: Bools, rows: NDArray[np.int32]) -> Doubles | None:
+def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32]) -> Float64Array | None:
     """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too few edges.
 
     Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
@@ -178,7 +178,7 @@ def edge_numbers(observations: Singles, mask: Bools, rows: NDArray[np.int32]) ->
     return np.array([*np.quantile(steepest, (0.25, 0.75)), between, two / square, three / square])
 
 
-def _product(one: Singles, other: Singles) -> float:
+def _product(one: Float32Array, other: Float32Array) -> float:
     return float((one * other).sum(dtype=np.float64))
 
 

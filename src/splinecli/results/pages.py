@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli import __version__
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
@@ -276,7 +276,7 @@ def _thumbnail(path: Path) -> str | None:
 
     try:
         # 33 megapixels of 16 bits; larger files may be decompression bombs.
-        if image_bytes(*read_facts(path).size) > 10**9:
+        if image_bytes(*read_header(path).size) > 10**9:
             return None
         picture = decode_image(path)
     except InputError:

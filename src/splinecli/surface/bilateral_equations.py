@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths import Bools, Doubles, Floats
+from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
 
@@ -47,9 +47,9 @@ SMALLEST_COSINE = 0.05
 class BilateralEquations:
     """The equations of P pixels."""
 
-    facing: Doubles  # (P,), zero where the normal is not usable
+    facing: Float64Array  # (P,), zero where the normal is not usable
     # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
-    slants: tuple[Doubles, Doubles]
+    slants: tuple[Float64Array, Float64Array]
     # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
     # above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
@@ -75,7 +75,7 @@ class BilateralEquations:
             (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
         )
 
-    def weigh(self, heights: Doubles, discontinuity: float) -> tuple[Doubles, Doubles]:
+    def weigh(self, heights: Float64Array, discontinuity: float) -> tuple[Float64Array, Float64Array]:
         """Return the weights of all pairs at the heights (P,), and their flows.
 
         The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
@@ -139,13 +139,13 @@ class LaplacianSolver:
 
     def solve(
         self,
-        weights: Doubles,
-        flows: Doubles,
+        weights: Float64Array,
+        flows: Float64Array,
         *,
         precision: float,
-        pull: Doubles | float = 0.0,
-        distance: Doubles | float = 0.0,
-    ) -> Doubles:
+        pull: Float64Array | float = 0.0,
+        distance: Float64Array | float = 0.0,
+    ) -> Float64Array:
         """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
 
         Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
@@ -160,7 +160,7 @@ class LaplacianSolver:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
         steps = count()
-        change: Doubles
+        change: Float64Array
         change, _ = cg(
             matrix,
             self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
@@ -173,12 +173,12 @@ class LaplacianSolver:
             self._preconditioner = None
         return change
 
-    def _laplacian(self, weights: Doubles, pull: Doubles | float) -> Any:
+    def _laplacian(self, weights: Float64Array, pull: Float64Array | float) -> Any:
         from scipy.sparse import csr_matrix
 
         diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
         return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 
-    def _sum(self, of_pairs: Doubles, pixels: Pixels) -> Doubles:
+    def _sum(self, of_pairs: Float64Array, pixels: Pixels) -> Float64Array:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

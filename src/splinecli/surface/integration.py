@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Doubles, Floats, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.surface.bilateral_equations import DISCONTINUITY, SMALLEST_COSINE, BilateralEquations, LaplacianSolver
 from splinecli.surface.pixel_grid import Blocks, focal_length
@@ -45,7 +45,7 @@ def integrate_normals(
     prior: Floats | None = None,
     prior_detail: float | None = None,
     progress: Progress = lambda share: None,
-) -> Doubles:
+) -> Float64Array:
     """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera matrix, it is the
@@ -87,7 +87,7 @@ def integrate_normals(
     return _depth_map(_integrate(surface, discontinuity, progress), mask, camera_matrix, known)
 
 
-def relief_of_normals(normal_map: Singles, mask: Bools) -> Singles:
+def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
     Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
@@ -106,7 +106,7 @@ class _Surface(NamedTuple):
     normal_map: Floats
     mask: Bools
     camera_matrix: Floats | None
-    prior: Doubles | None
+    prior: Float64Array | None
     prior_detail: float
 
     def of_blocks(self, blocks: Blocks, *, keep_edges: bool) -> _Surface:
@@ -123,7 +123,7 @@ class _Surface(NamedTuple):
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
 
-def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Doubles:
+def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Float64Array:
     """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
@@ -132,7 +132,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
-    heights: Doubles = np.zeros(n_pixels)
+    heights: Float64Array = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
@@ -161,7 +161,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> D
     return heights
 
 
-def _normals_of(blocks: Blocks, normals: Doubles, mask: Bools, *, keep_edges: bool) -> Doubles:
+def _normals_of(blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool) -> Float64Array:
     """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or the steepest one.
 
     With keep_edges, a block that contains an edge has the steepest normal, which belongs to the rim. The mean over an
@@ -182,7 +182,7 @@ def _normals_of(blocks: Blocks, normals: Doubles, mask: Bools, *, keep_edges: bo
     return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
-def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Doubles:
+def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
     """Return the heights (P,) of a prior in the unit of the equations, NaN where it is not known."""
     if prior.shape != mask.shape:
         raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape}, that of the normal map")
@@ -243,7 +243,9 @@ def _mask_of_normals(normal_map: Floats) -> Bools:
     return mask
 
 
-def _depth_map(heights: Doubles, mask: Bools, camera_matrix: Floats | None, prior: Doubles | None) -> Doubles:
+def _depth_map(
+    heights: Float64Array, mask: Bools, camera_matrix: Floats | None, prior: Float64Array | None
+) -> Float64Array:
     from scipy.ndimage import label
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do

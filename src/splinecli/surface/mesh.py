@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
 from splinecli.surface.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
 from splinecli.system.machine import import_extra
@@ -28,18 +28,18 @@ from splinecli.system.machine import import_extra
 class SurfaceMesh:
     """A triangle mesh with the textures of its image."""
 
-    vertices: Singles  # (V, 3) float32
+    vertices: Float32Array  # (V, 3) float32
     # (T, 3) int32, the numbers of three vertices each, counter-clockwise as viewed by the camera
     triangles: NDArray[np.int32]
-    normals: Singles  # (V, 3) float32, unit
+    normals: Float32Array  # (V, 3) float32, unit
     # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from 0 at
     # the top to 1 at the bottom, as in glTF
-    uvs: Singles
+    uvs: Float32Array
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if `normals` are
     # exact.
     normal_texture: NDArray[np.uint8] | None = None
-    tangents: Singles | None = None  # (V, 3) float32, unit; only with a normal texture
+    tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
     def colours(self) -> NDArray[np.uint8] | None:
@@ -120,7 +120,7 @@ def no_triangles(path: Path | None = None, *, instead: str = "leave glb out of t
     )
 
 
-def vertex_normals(vertices: Floats, triangles: Integers) -> Doubles:
+def vertex_normals(vertices: Floats, triangles: Integers) -> Float64Array:
     """Return the unit normals (V, 3) of vertices: means over their triangles, weighted by area.
 
     A vertex without triangles has the normal (0, 0, 1).
@@ -128,12 +128,12 @@ def vertex_normals(vertices: Floats, triangles: Integers) -> Doubles:
     first, second, third = np.moveaxis(vertices[triangles].astype(np.float64), 1, 0)
     faces = np.cross(second - first, third - first).repeat(3, axis=0)
     sums = [np.bincount(triangles.ravel(), faces[:, axis], len(vertices)) for axis in range(3)]
-    normals: Doubles = unit(np.stack(sums, axis=1).astype(np.float64))
+    normals: Float64Array = unit(np.stack(sums, axis=1).astype(np.float64))
     normals[~normals.any(axis=1)] = (0, 0, 1)
     return normals
 
 
-def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Singles:
+def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
     """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see SurfaceMesh.uvs."""
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
@@ -151,7 +151,7 @@ def fill_outside(texture: NDArray[np.uint8], known: Bools) -> NDArray[np.uint8]:
     return np.asarray(texture[rows, columns])
 
 
-def _triangles(heights: Doubles, mask: Bools) -> NDArray[np.int32]:
+def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).
@@ -269,7 +269,7 @@ def _mesh_of_blocks(
     return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
 
 
-def _tangents(vertices: Doubles, normals: Doubles, camera_matrix: Floats | None) -> Doubles:
+def _tangents(vertices: Float64Array, normals: Float64Array, camera_matrix: Floats | None) -> Float64Array:
     """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row of the image.
 
     A row of the image shows the plane that contains the viewing rays of the row. This is how viewers compute tangents
@@ -283,7 +283,7 @@ def _tangents(vertices: Doubles, normals: Doubles, camera_matrix: Floats | None)
 
 
 def _normal_texture(
-    points: Doubles, triangles: Integers, normals: Doubles, tangents: Doubles, normal_map: Floats
+    points: Float64Array, triangles: Integers, normals: Float64Array, tangents: Float64Array, normal_map: Floats
 ) -> NDArray[np.uint8]:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
 
@@ -303,7 +303,7 @@ def _normal_texture(
     return fill_outside(texture, known)
 
 
-def _in_frame(measured: Doubles, normals: Doubles, tangents: Doubles) -> Doubles:
+def _in_frame(measured: Float64Array, normals: Float64Array, tangents: Float64Array) -> Float64Array:
     """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be perpendicular to N."""
     bitangents = np.cross(normals, tangents)
     along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals))
@@ -315,8 +315,8 @@ def _in_frame(measured: Doubles, normals: Doubles, tangents: Doubles) -> Doubles
 
 
 def _covered_pixels(
-    points: Doubles, triangles: Integers, shape: tuple[int, ...]
-) -> Iterator[tuple[NDArray[np.intp], Doubles, NDArray[np.intp], NDArray[np.intp]]]:
+    points: Float64Array, triangles: Integers, shape: tuple[int, ...]
+) -> Iterator[tuple[NDArray[np.intp], Float64Array, NDArray[np.intp], NDArray[np.intp]]]:
     """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
     for start in range(0, len(triangles), _TRIANGLES):
         numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
@@ -339,7 +339,7 @@ def _covered_pixels(
         yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
 
 
-def _barycentric_forms(corners: Doubles) -> Doubles:
+def _barycentric_forms(corners: Float64Array) -> Float64Array:
     """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
@@ -350,7 +350,7 @@ def _barycentric_forms(corners: Doubles) -> Doubles:
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 
 
-def _ranges(first: Doubles, last: Doubles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _ranges(first: Float64Array, last: Float64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the whole numbers from each first to its last, and before them the number of the range of each."""
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Array, Bools, Doubles, Floats, Integers, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 
 Places = NDArray[np.number[Any]]
 
 _LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 
 
-def pixel_rays(mask: Bools, camera_matrix: Floats) -> Doubles:
+def pixel_rays(mask: Bools, camera_matrix: Floats) -> Float64Array:
     """Return the points (P, 3) at depth 1, z = -1, on the rays from a camera at the origin to pixels of a mask (H, W).
 
     Raises UsageError if the camera matrix is not 3 x 3, or InputError if it is not a valid camera matrix.
@@ -31,13 +31,13 @@ def pixel_rays(mask: Bools, camera_matrix: Floats) -> Doubles:
     return rays_at(rows, columns, camera_matrix)
 
 
-def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Doubles:
+def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Float64Array:
     """Return the points (N, 3) of pixel_rays at rows and columns (N,) of the image. Raises the same errors."""
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
     return image @ ray_basis(camera_matrix)
 
 
-def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None) -> Doubles:
+def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None) -> Float64Array:
     """Return the columns and rows (P, 2) of the projections of points (P, 3); without a matrix they are orthographic.
 
     The points are relative to the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
@@ -53,7 +53,7 @@ def focal_length(camera_matrix: Floats) -> float:
     return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))
 
 
-def ray_basis(camera_matrix: Floats) -> Doubles:
+def ray_basis(camera_matrix: Floats) -> Float64Array:
     """Return the rows (3, 3) that map an image point (column, row, 1) to its ray.
 
     The first row is the step of a ray from one column to the next, the second the step from one row to the next, and
@@ -140,7 +140,7 @@ class Blocks:
         nearest = distance_transform_edt(~self.mask, return_distances=False, return_indices=True)
         return np.asarray(values[number[tuple(nearest)]])
 
-    def sample(self, maps: Singles, rows: Integers, columns: Integers) -> Singles:
+    def sample(self, maps: Float32Array, rows: Integers, columns: Integers) -> Float32Array:
         """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation between the centres."""
         height, width, count = maps.shape
         found = np.zeros((len(rows), count), np.float32)

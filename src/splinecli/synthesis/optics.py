@@ -1,7 +1,7 @@
 """The camera between the object and the files: lens, Bayer pattern, sharpening and JPEG, and translucent materials.
 
 These effects mix neighbouring pixels, so they act on whole images (F, H, W) of linear radiance, background included.
-Each draw documents its distribution. Faults that affect each pixel separately are in faults.py.
+Each draw documents its distribution. Faults that affect each pixel separately are in batches.py.
 """
 
 from __future__ import annotations

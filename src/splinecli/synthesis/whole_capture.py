@@ -10,15 +10,18 @@ from torch.nn.functional import max_pool2d, pad
 
 from splinecli.restoration.images import restore_saturated
 from splinecli.restoration.lens_blur import remove_blur, surroundings
-from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth, photograph
-from splinecli.synthesis.engraved import draw_engraved
-from splinecli.synthesis.faults import (
+from splinecli.synthesis.batches import (
+    CaptureConfig,
+    PixelBatch,
+    PixelTruth,
     add_sensor_noise,
     disturb_light_directions,
     disturb_light_intensities,
     draw_light_intensities,
+    photograph,
     quantise,
 )
+from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.optics import draw_optics
 from splinecli.synthesis.random_numbers import draw_number
 
@@ -74,7 +77,7 @@ def photograph_scene(
     Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the lights, as from room
     light, and of the capture's mean, as from lens glare; see `_ambient`.
 
-    The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
+    The functions of synthesis/batches.py draw faults for each row. Here the whole capture is one row. The exposure
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
     the observations are clipped, and restored as in `infer`. A third of the captures with sensor noise also have grain:
     each observation is multiplied by its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture causes such grain

@@ -13,8 +13,7 @@ from torch.nn.functional import pad
 
 from splinecli.fits.least_squares import alternating_signs
 from splinecli.inference import estimate_pixels
-from splinecli.lights.indirect_light import IndirectLight
-from splinecli.lights.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting, parts_of_pixels
 from splinecli.methods.batched import NetworkEstimator
 from splinecli.networks.li_ne_net import error_negative_log_likelihood
 from splinecli.networks.refine_net import channels, split_features
@@ -227,21 +226,21 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     estimator = NetworkEstimator(method, loaded, device=network.cells.device, precision="float32")
     directions = light_directions.numpy()
 
-    def light_without(indirect: IndirectLight | None, rows: Rows) -> LampLight:
+    def lighting_without(indirect: IndirectLight | None, rows: PixelIndices) -> PixelLighting:
         own = observations.numpy()[rows]
-        return LampLight(own if indirect is None else indirect.remove(own, rows), directions)
+        return PixelLighting(own if indirect is None else indirect.remove(own, rows), directions)
 
-    estimated, errors, light_of = estimate_pixels(mask.numpy(), observations.numpy(), light_without, estimator)
+    estimated, errors, lighting_at = estimate_pixels(mask.numpy(), observations.numpy(), lighting_without, estimator)
     assert errors is not None, "TrainingConfig asks for an error head"
     lights = light_directions.to(estimator.device)
     signs, reference = alternating_signs(lights), brightness(observations)
 
-    def features_of(rows: Rows) -> Tensor:
-        values = light_of(rows).observations, estimated[rows], errors[rows]
+    def features_of(rows: PixelIndices) -> Tensor:
+        values = lighting_at(rows).observations, estimated[rows], errors[rows]
         seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
         return refine_features(seen, lights, normals, error, reference, signs)
 
-    return torch.cat([features_of(rows) for rows in parts_of_rows(len(observations))])
+    return torch.cat([features_of(rows) for rows in parts_of_pixels(len(observations))])
 
 
 def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:

@@ -9,7 +9,7 @@ from PIL import Image
 from scenes import ring_lights, write_capture
 from splinecli import capture_warnings
 from splinecli.capture import read_capture
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
 
@@ -24,7 +24,7 @@ def test_pixels(tmp_path: Path, suffix: str, options: dict[str, str], mode: str,
     path = tmp_path / f"image{suffix}"
     expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
     np.testing.assert_array_equal(decode_image(path), expected)
-    facts = read_facts(path)
+    facts = read_header(path)
     assert facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
 
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
 from splinecli.capture import open_capture
-from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_facts
+from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_header
 from splinecli.errors import InputError
 
 EXIF = 0x8769
@@ -34,8 +34,8 @@ def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_reading(tmp_path: Path, suffix: str) -> None:
-    assert find_exposure(read_facts(write(tmp_path / f"a.{suffix}"))) == Exposure(1 / 60, 8.0, 100)
-    assert find_exposure(read_facts(write(tmp_path / f"b.{suffix}", None))) is None
+    assert find_exposure(read_header(write(tmp_path / f"a.{suffix}"))) == Exposure(1 / 60, 8.0, 100)
+    assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
 
 
 def test_mixed_exposures_are_divided_out(tmp_path: Path) -> None:
@@ -74,17 +74,17 @@ def turned(folder: Path, name: str, orientation: int | None) -> Path:
 @pytest.mark.parametrize(("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)])
 def test_one_orientation(tmp_path: Path, tag: int | None, expected: int) -> None:
     images = [turned(tmp_path, "a.jpg", tag), turned(tmp_path, "b.tif", tag), turned(tmp_path, "c.png", tag)]
-    assert common_orientation([read_facts(image) for image in images]) == expected
+    assert common_orientation([read_header(image) for image in images]) == expected
 
 
 def test_the_pixels_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Decoding takes seconds for an image of 24 megapixels."""
     image = turned(tmp_path, "c.png", 6)
     monkeypatch.setattr(ImageFile.ImageFile, "load", None)
-    assert common_orientation([read_facts(image)]) == 6
+    assert common_orientation([read_header(image)]) == 6
 
 
 def test_different_orientations_are_refused(tmp_path: Path) -> None:
     images = [turned(tmp_path, "a.jpg", None), turned(tmp_path, "b.jpg", 1), turned(tmp_path, "c.jpg", 8)]
     with pytest.raises(InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"):
-        common_orientation([read_facts(image) for image in images])
+        common_orientation([read_header(image) for image in images])

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import directions_at, shade, sphere
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.film import FEWEST_FRAMES, MOST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
@@ -79,7 +79,7 @@ def test_the_curve_is_undone(tmp_path: Path) -> None:
     stored = encode_bt709(linear).astype(np.float32)
     np.testing.assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
     (tmp_path / "frame.png").write_bytes(encode_png(np.zeros((4, 4, 3), np.uint8), film=True))
-    facts = read_facts(tmp_path / "frame.png")
+    facts = read_header(tmp_path / "frame.png")
     assert facts.curve.curve == BT709 and facts.damage is None
 
 
@@ -90,7 +90,7 @@ def test_code_points_go_before_other_curves(tmp_path: Path, number: int, curve: 
     place = file.index(b"cICP") + 5
     for value, expected in ((number, (curve, False)), (16, (1.0, True))):
         (tmp_path / "image.png").write_bytes(file[:place] + bytes([value]) + file[place + 1 :])
-        found = read_facts(tmp_path / "image.png").curve
+        found = read_header(tmp_path / "image.png").curve
         assert (found.curve, found.unread) == expected
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.files import AMBIENT, MASK, find_named, list_images
-from splinecli.capture.formats.facts import Exposure, find_exposure, read_facts
+from splinecli.capture.formats.facts import Exposure, find_exposure, read_header
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
 
@@ -210,20 +210,20 @@ def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("without_rawpy")
 def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
     stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
-    assert find_exposure(read_facts(stated)) == Exposure(*SHOT)
-    assert find_exposure(read_facts(write_dng(tmp_path / "b.dng", mosaic(ramp())))) is None
+    assert find_exposure(read_header(stated)) == Exposure(*SHOT)
+    assert find_exposure(read_header(write_dng(tmp_path / "b.dng", mosaic(ramp())))) is None
     # The header of Olympus.
     other = write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
-    assert find_exposure(read_facts(other)) is None
-    assert read_facts(stated).curve.curve == 1
+    assert find_exposure(read_header(other)) is None
+    assert read_header(stated).curve.curve == 1
 
 
 @pytest.mark.usefixtures("needs_rawpy")
 def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_dng(tmp_path / "a.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
-    assert find_exposure(read_facts(path)) == Exposure(*SHOT)
+    assert find_exposure(read_header(path)) == Exposure(*SHOT)
     path.write_bytes(path.read_bytes()[:2000])
-    assert find_exposure(read_facts(path)) is None
+    assert find_exposure(read_header(path)) is None
     assert capfd.readouterr() == ("", "")
 
 
@@ -237,7 +237,7 @@ def test_the_white_level_is_that_of_the_developed_values(tmp_path: Path, thumbna
         if thumbnail:  # one value for the first picture, as cameras store; LibRaw reads the others
             tags = [struct.pack("<HHIHH", 258, 3, 1, bits, 0) for bits in (16, 8)]
             path.write_bytes(path.read_bytes().replace(*tags))
-        assert read_facts(path).white_level == 65535
+        assert read_header(path).white_level == 65535
     (tmp_path / "lights.txt").write_text(LIGHTS)
     if not thumbnail:
         capture = read_capture(tmp_path)

@@ -18,7 +18,7 @@ from scenes import png_chunk
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.calibration.lamps import measure_light_intensities
 from splinecli.capture import open_capture
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import ExpectedSize, check_stored_size, decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.light_files import read_light_directions
@@ -213,12 +213,12 @@ def test_headers_without_end(tmp_path: Path) -> None:
     refused(lambda: decode_image(jpeg), "the JPEG is truncated")
     plain = cv2.imencode(".png", np.zeros(SMALL, np.uint8))[1].tobytes()
     png.write_bytes(plain[:33] + png_chunk(b"tEXt", b"") * 1_000_000 + plain[33:])
-    assert read_facts(png).white_level is None
+    assert read_header(png).white_level is None
     refused(lambda: decode_image(png), "the PNG is truncated")
     png.write_bytes(plain[:33])
     with png.open("ab") as file:
         file.truncate(3 << 30)
-    assert read_facts(png).curve.curve == 1
+    assert read_header(png).curve.curve == 1
     mat.write_bytes(bytes(126) + b"IM")
     with mat.open("ab") as file:
         file.truncate(3 << 30)

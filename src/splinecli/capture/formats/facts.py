@@ -73,7 +73,7 @@ _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: 
 
 
 @dataclass(frozen=True)
-class ImageFacts:
+class ImageHeader:
     """The facts in the header of an image file."""
 
     path: Path
@@ -104,13 +104,13 @@ class ImageFacts:
         return self.stated_size
 
 
-def read_facts(path: Path) -> ImageFacts:
+def read_header(path: Path) -> ImageHeader:
     """Return the facts of an image file. It is opened once; nothing is decoded."""
     try:
         with open_image(path) as (file, kind):
             return facts_in(file, kind, path)
     except InputError as error:
-        return ImageFacts(path, damage=error)
+        return ImageHeader(path, damage=error)
 
 
 @contextmanager
@@ -133,25 +133,25 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         yield file, kind
 
 
-def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:
+def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
     """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
-        return ImageFacts(path, kind, white_level=_RAW_WHITE, exif=exif)
+        return ImageHeader(path, kind, white_level=_RAW_WHITE, exif=exif)
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)
             size = (picture.height, picture.width, channels), 1
             if kind in ("BMP", "TGA"):  # they state nothing else
-                return ImageFacts(path, kind, size)
+                return ImageHeader(path, kind, size)
             curve = _curve(StatedCurve(SRGB, kind), picture.info.get("icc_profile"))
             exif = _exif_tags(lambda tags: tags.load(picture.info.get("exif") or b""))
-            return ImageFacts(path, kind, size, curve, exif=exif)
+            return ImageHeader(path, kind, size, curve, exif=exif)
     if kind in ("PGM", "PPM"):
         width, height, most, _ = pnm_header(file.read(_LONGEST_HEADER)) or (0, 0, 0, 0)
         shape = (height, width, 1 if kind == "PGM" else 3)
         level = most if 255 < most < 65_535 else None
-        return ImageFacts(path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level)
+        return ImageHeader(path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level)
     read = {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind]
     return read(file, path)
 
@@ -178,7 +178,7 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
         yield Image.open(file, formats=[kind])
 
 
-def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
+def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
     file.seek(len(PNG))
     chunks: dict[bytes, bytes] = {}
     for name, content in _png_chunks(file):
@@ -203,7 +203,7 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
-    return ImageFacts(path, "PNG", size, curve, level, _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))))
+    return ImageHeader(path, "PNG", size, curve, level, _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))))
 
 
 def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
@@ -217,7 +217,7 @@ def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
         yield header[4:], content
 
 
-def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
+def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
     size, exif, parts = None, b"", dict[bytes, bytes]()
     for marker, length in _jpeg_segments(file):
         if _is_frame(marker) and len(frame := file.read(6)) == 6:
@@ -233,7 +233,7 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
         short = sum(map(len, parts.values())) <= LARGEST_PROFILE
         profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
     curve = _curve(StatedCurve(SRGB, "JPEG"), profile)
-    return ImageFacts(path, "JPEG", size, curve, exif=_exif_tags(lambda tags: tags.load(exif)))
+    return ImageHeader(path, "JPEG", size, curve, exif=_exif_tags(lambda tags: tags.load(exif)))
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
@@ -256,7 +256,7 @@ def _is_frame(marker: int) -> bool:
     return 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
 
 
-def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
+def _tiff_facts(file: BinaryIO, path: Path) -> ImageHeader:
     with first_page(file, path) as page:
         bits = int(page.bitspersample)
         size = (page.imagelength, page.imagewidth, page.samplesperpixel), -(-bits // 8)
@@ -280,7 +280,7 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
     elif bits < 16:
         level = _level(bits)
     exif = _exif_tags(load) if has_exif else {}  # Pillow reads all tags, however long
-    return ImageFacts(path, "TIFF", size, _curve(StatedCurve(), profile), level, exif)
+    return ImageHeader(path, "TIFF", size, _curve(StatedCurve(), profile), level, exif)
 
 
 def _one_value(tag: object) -> int | None:
@@ -346,7 +346,7 @@ class Exposure(NamedTuple):
         return f"{time} s, f/{self.f_number:g}, ISO {self.iso:.0f}"
 
 
-def find_exposure(facts: ImageFacts) -> Exposure | None:
+def find_exposure(facts: ImageHeader) -> Exposure | None:
     """Return the exposure of an image; None if a part of it is missing or the file is damaged."""
     try:
         if facts.exif is None and facts.kind == "RAW":
@@ -360,7 +360,7 @@ def find_exposure(facts: ImageFacts) -> Exposure | None:
     return exposure if all(0 < value < math.inf for value in exposure) else None
 
 
-def check_exposures(images: Sequence[ImageFacts]) -> None:
+def check_exposures(images: Sequence[ImageHeader]) -> None:
     """Raise InputError if two images state different exposures."""
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
@@ -371,7 +371,7 @@ def check_exposures(images: Sequence[ImageFacts]) -> None:
             raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
 
 
-def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | None:
+def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] | None:
     """Return the exposure of each image, relative to their mean, and a sentence about them; None for equal ones.
 
     Images without a stated exposure are refused beside images with different ones, as in check_exposures.
@@ -394,7 +394,7 @@ def exposure_factors(images: Sequence[ImageFacts]) -> tuple[list[float], str] | 
     return [exposure.relative / mean for exposure in found], text
 
 
-def common_orientation(images: Sequence[ImageFacts]) -> int:
+def common_orientation(images: Sequence[ImageHeader]) -> int:
     """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT if they state none.
 
     The orientation of RAW files is ignored: their pixels are read in the sensor's orientation. Raises InputError for

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.images import check_stored_size
 from splinecli.errors import InputError
-from splinecli.maths import Singles
+from splinecli.maths import Float32Array
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
 from splinecli.system.files import check_file, is_folder, utf8_name
@@ -45,7 +45,7 @@ _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIF
 
 
 # A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels.
-_Candidate = tuple[int, Singles, float, float]
+_Candidate = tuple[int, Float32Array, float, float]
 
 
 def is_film(path: Path) -> bool:
@@ -134,7 +134,7 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     return number, linear.ravel(), sharpness, clipped
 
 
-def _farthest(thumbnails: Singles) -> list[int]:
+def _farthest(thumbnails: Float32Array) -> list[int]:
     """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is ignored."""
     if not len(thumbnails):
         return []

@@ -31,7 +31,7 @@ from splinecli.capture.formats.decoders import (
 from splinecli.capture.formats.facts import (
     PILLOW_KINDS,
     PNG,
-    ImageFacts,
+    ImageHeader,
     StoredSize,
     facts_in,
     open_image,
@@ -39,7 +39,7 @@ from splinecli.capture.formats.facts import (
     pnm_header,
 )
 from splinecli.errors import InputError
-from splinecli.maths import Array, Bools, Singles
+from splinecli.maths import Array, Bools, Float32Array
 from splinecli.system.files import StrPath
 from splinecli.system.machine import LARGEST_IMAGE, available_memory
 
@@ -102,7 +102,7 @@ def _gigabytes(n_bytes: float) -> str:
     return f"{n_bytes / 1e9:.1f} GB"
 
 
-def common_size(images: Sequence[ImageFacts]) -> StoredSize:
+def common_size(images: Sequence[ImageHeader]) -> StoredSize:
     """Return the size of the largest of some images.
 
     Raises InputError if one has another height or width than the first, is too large, or has an incomplete header.
@@ -258,7 +258,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
     raise InputError("the JPEG is truncated", path=path, hint=COPY_AGAIN)
 
 
-def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Singles:
+def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
     """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be linear.
 
     The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
@@ -270,7 +270,7 @@ def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Singles:
     return to_linear(decode_image(Path(path), expected), Path(path))
 
 
-def to_linear(stored: Array, path: Path) -> Singles:
+def to_linear(stored: Array, path: Path) -> Float32Array:
     """Return stored values of any shape as float32 on the scale of read_image.
 
     Raises InputError for a floating-point value that is negative or not finite.

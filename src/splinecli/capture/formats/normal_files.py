@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import (
     ExpectedSize,
     check_stored_size,
@@ -30,7 +30,7 @@ from splinecli.capture.formats.images import (
 )
 from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
 from splinecli.errors import InputError
-from splinecli.maths import Array, Bools, Doubles, Singles
+from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
@@ -54,7 +54,9 @@ class _Stored(NamedTuple):
     is_picture: bool
 
 
-def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl") -> Singles:
+def read_normal_map(
+    path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl"
+) -> Float32Array:
     """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a normal.
 
     Args:
@@ -70,7 +72,7 @@ def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, conventi
     expected = None
     if mask is not None:
         # Both headers are compared before either file is decoded.
-        shape = read_facts(mask).size[0] if isinstance(mask, Path) else mask.shape
+        shape = read_header(mask).size[0] if isinstance(mask, Path) else mask.shape
         expected = ExpectedSize(shape, "the mask", "a normal map")
     stored = _read_vectors(path, expected)
     if isinstance(mask, Path):
@@ -85,7 +87,7 @@ def read_normal_map(path: StrPath, mask: Bools | Path | None = None, *, conventi
     return normals
 
 
-def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Singles, bool]:
+def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
     Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text files are flipped
@@ -134,7 +136,7 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
     return _Stored(values, alpha, values.dtype.kind == "u")
 
 
-def _read_text(path: Path, height: int, width: int) -> Doubles:
+def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
     most = 3 * height * width * _LONGEST_NUMBER + MOST_TEXT
     check_length(path, most, "a normal map")
@@ -153,7 +155,7 @@ def _read_text(path: Path, height: int, width: int) -> Doubles:
     return rows.reshape(height, width, 3)
 
 
-def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False) -> Singles:
+def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False) -> Float32Array:
     """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are not normals.
 
     With check_floats, floating-point values must have about unit length, too, as colours must.
@@ -197,7 +199,7 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
         )
 
 
-def read_depth(path: Path, expected: ExpectedSize) -> Doubles:
+def read_depth(path: Path, expected: ExpectedSize) -> Float64Array:
     """Return a depth map (H, W) float64, NaN where it is not finite because the depth is unknown.
 
     Raises:

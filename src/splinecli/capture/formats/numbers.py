@@ -21,7 +21,7 @@ from splinecli.capture.formats.decoders import damage_as_input_error
 from splinecli.capture.formats.facts import JPEG, PNG, TIFF
 from splinecli.capture.formats.images import ExpectedSize, check_stored_size, check_vectors
 from splinecli.errors import InputError
-from splinecli.maths import Array, Doubles
+from splinecli.maths import Array, Float64Array
 from splinecli.system.files import check_file, is_substitution, reading
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -54,10 +54,10 @@ class NumberRows:
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
     names: tuple[str, ...] | None = None  # of each row's image, without folders; None if rows begin with numbers
-    intensities: Doubles | None = None  # (R, 3), RGB, of the lights of a file that has them
+    intensities: Float64Array | None = None  # (R, 3), RGB, of the lights of a file that has them
     are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
 
-    def as_array(self) -> Doubles:
+    def as_array(self) -> Float64Array:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
         lengths = [len(row.numbers) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]

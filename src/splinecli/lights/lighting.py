@@ -1,4 +1,6 @@
-"""Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
+"""The light of near lamps on a surface: points in space, and observations as distant lamps would give them.
+
+Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
 
 The photographs show how bright each visible part of the object is under each light, after all reflections. A matte part
 is as bright from all sides. Estimated normals give the surface. Together they give the light that arrives at a pixel
@@ -10,17 +12,113 @@ enough. Attached shadows show both, because a pixel reflects only indirect light
 plane.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from splinecli.lights.lamp_light import LampLight, LightOf, Rows, parts_of_rows
-from splinecli.maths import Bools, Doubles, Floats, Singles
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
 from splinecli.surface.integration import integrate_normals
-from splinecli.surface.pixel_grid import Blocks
+from splinecli.surface.pixel_grid import Blocks, focal_length, ray_basis, rays_at
 from splinecli.system.machine import side_by_side
+
+
+def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Floats) -> Float32Array:
+    """Return the points (N, 3) of a surface, in the unit of the lamps' positions.
+
+    Args:
+        rows, columns: (N,), in pixels; (0, 0) is the centre of the first pixel.
+        depth: (N,), as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here in
+            multiples of the mean plane's depth.
+    """
+    if lamps.camera_matrix is None:
+        middle_row, middle_column = lamps.middle
+        points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
+    else:
+        rays = rays_at(rows, columns, lamps.camera_matrix)
+        points = rays * (depth * _plane_distance(lamps))[:, None] + _camera_position(lamps)
+    return points.astype(np.float32)
+
+
+def flat_depth(lamps: NearLamps) -> float:
+    """Return the depth of the object's mean plane; see surface_points."""
+    return 0.0 if lamps.camera_matrix is None else 1.0
+
+
+@dataclass(frozen=True)
+class PixelLighting:
+    """Observations as distant lamps would give them, with the light directions of each pixel."""
+
+    observations: Float32Array  # (P, F), without the falloff of the lamps
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights and an
+    # orthographic camera
+    directions: Floats
+    turns: Float32Array | None = None  # (P, 3, 3), rotations from the capture's frame to these; None if all are equal
+
+    @classmethod
+    def of(cls, observations: Float32Array, lamps: NearLamps) -> PixelLighting:
+        """Return the light on the points of `lamps`, from observations (P, F)."""
+        assert lamps.points is not None
+        directions, attenuation = lamps.light_at(lamps.points)
+        turns = None
+        if lamps.camera_matrix is not None:
+            turns = _turns_to_view(unit(_camera_position(lamps) - lamps.points)).astype(np.float32)
+            directions = np.einsum("pij,pfj->pfi", turns, directions)
+        return cls(observations / attenuation, directions, turns)
+
+    @classmethod
+    def distant(cls, observations: Float32Array, directions: Floats, rays: Floats) -> PixelLighting:
+        """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3) from the camera."""
+        turns = _turns_to_view(unit(-rays)).astype(np.float32)
+        return cls(observations, np.einsum("pij,fj->pfi", turns, directions.astype(np.float32)), turns)
+
+    def in_frame_of_pixels(self, normals: Floats) -> Floats:
+        """Return normals (P, 3), given in the capture's frame, in the pixels' own."""
+        return normals if self.turns is None else np.einsum("pij,pj->pi", self.turns, normals)
+
+    def in_frame_of_capture(self, vectors: Floats) -> Floats:
+        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' own frames, in the capture's."""
+        return vectors if self.turns is None else np.einsum("pji,p...j->p...i", self.turns, vectors)
+
+
+PixelIndices = Integers  # numbers of some of a capture's pixels, in the order of its mask
+LightingAt = Callable[
+    [PixelIndices], PixelLighting
+]  # from rows of a capture's pixels to their observations and light directions
+LIT_AT_ONCE = 1 << 14  # pixels whose light is requested at once: under near lamps, each has its own lights
+
+
+def parts_of_pixels(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[PixelIndices]:
+    """Yield every step-th of the rows below `count`, `size` at a time."""
+    for start in range(0, count, step * size):
+        yield np.arange(start, min(start + step * size, count), step)
+
+
+def _plane_distance(lamps: NearLamps) -> float:
+    """Return the distance of the mean plane from the camera, from the width of a pixel there."""
+    assert lamps.camera_matrix is not None
+    return focal_length(lamps.camera_matrix) * lamps.pixel_size
+
+
+def _camera_position(lamps: NearLamps) -> Floats:
+    """Return the camera's place (3,): the image's middle shows the origin, at the distance of the mean plane."""
+    assert lamps.camera_matrix is not None
+    row, column = lamps.middle
+    middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
+    return np.asarray(-middle * _plane_distance(lamps))
+
+
+def _turns_to_view(views: Floats) -> Floats:
+    """Return the shortest rotations (P, 3, 3) of unit vectors (P, 3) with z > 0 onto the z axis."""
+    x, y, z = views.T
+    a, b, c = x * x / (1 + z), x * y / (1 + z), y * y / (1 + z)
+    return np.stack((1 - a, -b, -x, -b, 1 - c, -y, x, y, z), axis=1).reshape(-1, 3, 3)
+
 
 _BLOCKS = 1200  # parts of the surface that exchange light
 
@@ -37,7 +135,7 @@ class PixelPlaces:
         self._columns = np.concatenate([np.flatnonzero(row).astype(kind) for row in mask])
         self._ends = np.count_nonzero(mask, axis=1).cumsum()
 
-    def places(self, pixels: Rows) -> tuple[Rows, Rows]:
+    def places(self, pixels: PixelIndices) -> tuple[PixelIndices, PixelIndices]:
         """Return the rows and columns (n,) in the image of pixels with these numbers."""
         return np.searchsorted(self._ends, pixels, side="right"), self._columns[pixels]
 
@@ -47,21 +145,21 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Singles  # (h, w, F), the light at each block from the others. Other cells copy the nearest block
+    arriving: Float32Array  # (h, w, F), the light at each block from the others. Other cells copy the nearest block
     albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
-    def at(self, pixels: Rows) -> Singles:
+    def at(self, pixels: PixelIndices) -> Float32Array:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
         arriving = self.blocks.sample(self.arriving, *self.pixels.places(pixels))
         return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
-    def remove(self, observations: Singles, pixels: Rows) -> Singles:
+    def remove(self, observations: Float32Array, pixels: PixelIndices) -> Float32Array:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
         # Keep a share of each observation, because the gathered light is never exact.
         return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
 
-    def counts_at(self, observations: Singles, pixels: Rows) -> Bools:
+    def counts_at(self, observations: Float32Array, pixels: PixelIndices) -> Bools:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
         # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at
         # most.
@@ -69,7 +167,7 @@ class IndirectLight:
 
 
 def find_indirect_light(
-    mask: Bools, observations: Singles, light_of: LightOf, normals: Singles
+    mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None if the attached shadows show none that could be removed.
 
@@ -78,12 +176,12 @@ def find_indirect_light(
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed, divided by the intensities alone.
-        light_of: gives the observations of some pixels without the falloff of near lamps, and the light directions.
+        lighting_at: gives the observations of some pixels without the falloff of near lamps, and the light directions.
         normals: (P, 3) unit, in the capture's frame.
     """
     pixels = PixelPlaces(mask)
-    parts = partial(parts_of_rows, len(normals))
-    albedo = np.concatenate([*side_by_side(lambda rows: _albedo(light_of(rows), normals[rows]), parts())])
+    parts = partial(parts_of_pixels, len(normals))
+    albedo = np.concatenate([*side_by_side(lambda rows: _albedo(lighting_at(rows), normals[rows]), parts())])
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
         return None
@@ -95,12 +193,12 @@ def find_indirect_light(
     blocks = Blocks.over(object_mask, _BLOCKS)
     n_blocks = np.count_nonzero(blocks.mask)
 
-    def sum_up(rows: Rows) -> Doubles:
+    def sum_up(rows: PixelIndices) -> Float64Array:
         rows = rows[lit[rows]]
         # A block sends at most this many times the light of a matte one that faces the lamp. The rest is a
         # highlight, which goes in another direction.
         most = 3.0 * albedo[rows, None]
-        sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
+        sent = observations[rows] * (most / lighting_at(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
         values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
         return np.stack([np.bincount(number, column, n_blocks) for column in values.T], axis=1)
@@ -110,7 +208,7 @@ def find_indirect_light(
     covered = count[:, 0] / blocks.step**2
     arriving = _exchange(blocks, covered, unit(sums[:, 1:4]), sums[:, 4:] / count)
     indirect = IndirectLight(blocks, blocks.spread(arriving), albedo, pixels)
-    exposure = _exposure(indirect, observations, light_of, normals)
+    exposure = _exposure(indirect, observations, lighting_at, normals)
     if exposure is None:
         return None
     # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak
@@ -120,7 +218,7 @@ def find_indirect_light(
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
-def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Singles:
+def _exchange(blocks: Blocks, covered: Float64Array, normals: Float64Array, sent: Float64Array) -> Float32Array:
     """Return the light (p, F) that arrives at each block from the others, relative to the light a white one reflects.
 
     Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask covers, `normals`
@@ -144,7 +242,9 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     return np.asarray(factors @ sent.astype(np.float32))
 
 
-def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf, normals: Singles) -> float | None:
+def _exposure(
+    indirect: IndirectLight, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
+) -> float | None:
     """Return the factor from albedos in the observations' unit to true ones; None without visible indirect light.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
@@ -152,8 +252,8 @@ def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf,
     """
     found = []
     step = max(1, len(normals) // 50_000)
-    for pixels in parts_of_rows(len(normals), step=step):
-        light = light_of(pixels)
+    for pixels in parts_of_pixels(len(normals), step=step):
+        light = lighting_at(pixels)
         gathered = indirect.at(pixels)
         # In attached shadows, the cosine of the angle between light and normal is negative.
         shadow = (_cosines(light, normals[pixels]) < -0.05) & (gathered > 0)
@@ -176,14 +276,14 @@ def _exposure(indirect: IndirectLight, observations: Singles, light_of: LightOf,
     return exposure if exposure > 0 else None
 
 
-def _albedo(light: LampLight, normals: Singles) -> Singles:
+def _albedo(light: PixelLighting, normals: Float32Array) -> Float32Array:
     """Return the albedos (n,) of matte pixels, in the unit of the observations."""
     cosines = _cosines(light, normals).clip(min=0)
     shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
     return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
 
 
-def _cosines(light: LampLight, normals: Singles) -> Singles:
+def _cosines(light: PixelLighting, normals: Float32Array) -> Float32Array:
     """Return the cosines (n, F) of the angles between normals (n, 3) and lights."""
     own, directions = light.in_frame_of_pixels(normals), light.directions.astype(np.float32)
     if directions.ndim == 2:
