@@ -135,6 +135,9 @@ IMAGE_SCALE = WarningKind(
     "Save all images in one way",
     severity="error",
 )
+IMAGES_ALIGNED = WarningKind(
+    "images_aligned", "The images were [aligned](image-preparation.md#moved-images), as `--align` asks"
+)
 IMAGES_LEFT_OUT = WarningKind(
     "images_left_out",
     "The light file does not name all images, or pictures have names of masks or maps, or another size",
@@ -143,7 +146,7 @@ IMAGES_LEFT_OUT = WarningKind(
 IMAGES_SHIFTED = WarningKind(
     "images_shifted",
     "Images are [shifted against the others](input-checks.md#shifted-images)",
-    "Photograph from a tripod, or align the images first",
+    "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod",
     severity="error",
 )
 LAMP_DISTANCE = WarningKind(

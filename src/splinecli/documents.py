@@ -88,6 +88,15 @@ class SurfaceFacts(Document):
     discontinuity: NotNegative
 
 
+class AlignmentReport(Document):
+    """How images that moved were aligned: transforms from pixels (x, y, 1) of the reference, and motions in pixels."""
+
+    reference: str
+    model: Literal["translation", "similarity", "homography"]
+    transforms: list[Matrix]
+    moved_pixels: list[NotNegative]
+
+
 class EstimateReport(Document):
     """The part of a report of infer that describes the estimate."""
 
@@ -120,6 +129,7 @@ class EstimateReport(Document):
     white_level: WhiteLevel | None
     # standard deviation in pixels of the blur that was removed from the images
     removed_blur: float | None
+    alignment: AlignmentReport | None
     surface: SurfaceFacts | None
 
 

@@ -33,12 +33,31 @@ from splinecli.capture.linearise import (
     Window,
     collect_observations,
     pixel_reader,
+    take_around,
+    take_pixels,
 )
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
-from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
+from splinecli.capture_warnings import (
+    ESTIMATED_COLOURS,
+    GROUND_TRUTH_UPSIDE_DOWN,
+    IMAGES_ALIGNED,
+    CaptureWarning,
+    mask_inverted,
+)
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Float64Array, Integers
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
+from splinecli.restoration.alignment import (
+    LEAST_FIT,
+    MIN_IMAGES,
+    AlignedImages,
+    align_images,
+    common_pixels,
+    place_in_whole,
+    reduced,
+    resample,
+    stride_for,
+)
 from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
 from splinecli.restoration.lens_blur import remove_blur, surroundings
 
@@ -47,6 +66,7 @@ Image = TypeVar("Image")
 BYTES_OF_RESULTS = 52
 """Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
 
+LEAST_COMMON = 0.25  # share of the object that all aligned images must show
 _IMAGES = 2  # images in memory while read_ahead reads them
 _IMAGES_OF_MASK = 3  # images whose brightness outside the mask is checked
 Progress = Callable[[], object]  # called once after each image
@@ -64,6 +84,7 @@ class CaptureSource:
     radiometry: RadiometricCalibration = AS_STORED
     white_level: float | None = None  # stored value from which an observation is saturated; None to find it
     automatic_mask: Bools | None = None  # (H, W), made from the images instead of a file; see find_mask
+    alignment: AlignedImages | None = None  # the motion of the images, which is undone when they are read; see align
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
@@ -187,9 +208,56 @@ class CaptureSource:
         for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours, progress):
             total += colours.mean(axis=1)
         try:
-            return replace(self, automatic_mask=find_object(total.reshape(everywhere.shape)))
+            mask = find_object(total.reshape(everywhere.shape))
         except InputError as error:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
+        return replace(self, automatic_mask=mask if self.alignment is None else mask & self.alignment.common)
+
+    def align(self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None) -> CaptureSource:
+        """Return this capture with the chosen images (None for all) aligned to the first of them; see align_images.
+
+        Raises InputError if there are too few images, one does not fit the others, or they share too little of the
+        object.
+        """
+        indices = list(range(self.n_lights) if light_indices is None else light_indices)
+        names = [self.files.images[index].name for index in indices]
+        if len(indices) < MIN_IMAGES:
+            problem = (
+                f"--align needs {MIN_IMAGES} images or more, to predict each from the others; found {len(indices)}"
+            )
+            raise InputError(problem, path=self.files.folder, hint="Leave --align out, and align them elsewhere")
+        shape = common_size([self.facts[index] for index in indices])[0][:2]
+        mask = self.read_mask(shape)
+        stride = stride_for(len(indices) * mask.size)
+        pixels = self.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, progress)
+        images = np.stack([reduced(image.reshape(mask.shape), stride) for image in pixels])
+        lights = None if self.find_lights is not None else self.light_directions[indices]
+        found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)
+        if found.unexplained is not None:
+            name, moved = names[found.unexplained], stride * self.window.step * found.moved_pixels[found.unexplained]
+            problem = (
+                f"--align cannot explain {name}: moved by {moved:.0f} pixels, its correlation with the prediction of"
+                f" the other images is {found.fits[found.unexplained]:.2f}, expected {LEAST_FIT}"
+            )
+            hint = "Leave it out with --light-indices, mask the object if others moved with it, or leave --align out"
+            raise InputError(problem, path=self.files.folder, hint=hint)
+        left, top, *_ = self.window.box or (0, 0)
+        transforms = np.repeat(np.eye(3)[None], self.n_lights, axis=0)
+        transforms[indices] = place_in_whole(found.transforms, left, top, self.window.step, stride)
+        common = self.window.of(common_pixels(transforms, shape))
+        share = np.count_nonzero(mask & common) / np.count_nonzero(mask)
+        if share < LEAST_COMMON:
+            problem = f"--align: the images share only {100 * share:.0f} % of the object"
+            raise InputError(problem, path=self.files.folder, hint="Leave out images that show another part of it")
+        moved = found.moved_pixels * stride * self.window.step
+        how = f"They moved by up to {moved.max():.1f} pixels ({found.model})"
+        if not (found.transforms != np.eye(3)).any():
+            how = "None moved by a tenth of a pixel, so they were left as they are"
+        elif share < 1:
+            how += f"; the {100 - 100 * share:.1f} % of the object that not all of them show are left out"
+        warning = CaptureWarning(IMAGES_ALIGNED, f"The images were aligned to {names[0]}. {how}.")
+        aligned = AlignedImages(names[0], found.model, transforms, moved, common)
+        return replace(self, alignment=aligned, warnings=(*self.warnings, warning))
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of the window on images of this shape. Raises InputError, also for a huge shape."""
@@ -207,6 +275,8 @@ class CaptureSource:
         elif files.mask is not None:
             mask = read_mask(files.mask, expected)
         mask = self.window.of(mask)
+        if self.alignment is not None:
+            mask = mask & self.alignment.common
         if not mask.any():
             problem = "the mask has no pixel in the part that is read"
             hint = "Choose another --crop, or a larger --scale"
@@ -262,6 +332,8 @@ class CaptureSource:
         """
         like = self.files.images[indices[0]].name
         pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
+        if self.alignment is not None:
+            pixels_of = self._aligned_reader(self.alignment.transforms, mask, like, wanted, around)
 
         def read(index: int) -> Item:
             facts, intensity = self.facts[index], self.light_intensities[index]
@@ -271,6 +343,24 @@ class CaptureSource:
             yield item
             del item  # before the next one is decoded
             progress()
+
+    def _aligned_reader(
+        self, transforms: Float64Array, mask: Bools, like: str, wanted: Integers | slice, around: Bools | None
+    ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
+        """Return what pixel_reader returns, of images that are moved back as a whole."""
+        whole = np.ones(self.facts[0].size[0][:2], np.bool_)
+        read = pixel_reader(self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1))
+
+        def pixels(path: Path, index: int) -> tuple[Array, Float32Array]:
+            of_file, light = read(path, index)
+            moved = resample(of_file.reshape(*whole.shape, -1), light.reshape(*whole.shape, -1), transforms[index])
+            stored, linear = self.window.of(moved[0]), self.window.of(moved[1])
+            used = take_pixels(linear, mask)[wanted]
+            if around is not None:
+                used = np.concatenate((used, take_around(linear, around)))
+            return take_pixels(stored, mask), used
+
+        return pixels
 
 
 def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:

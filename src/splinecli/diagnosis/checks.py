@@ -42,7 +42,7 @@ def shifted_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
     text = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
-        f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
+        f" pixels: {named}{more}. The camera or the object moved. Add --align, or photograph from a tripod."
     )
     yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
 

@@ -233,6 +233,7 @@ def infer_capture(
             inputs_sha256(source, options.weights, loaded=loaded),
             light_file=source.files.light_directions,
             distillation=None if distilled is None else distilled.report(),
+            alignment=None if source.alignment is None else source.alignment.as_dict(capture.light_indices),
         )
         if source.light_numbers is not None:
             report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
@@ -284,9 +285,22 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
     if options.n_lights is not None:
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
+    if options.align:
+        source = align(source, indices, observer)
     with observer.progress(f"{name}: reading", count) as advance:
         capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
     return source, capture
+
+
+def align(source: CaptureSource, indices: Sequence[int] | None, observer: Observer) -> CaptureSource:
+    """Return the capture with its images aligned, and then with a new automatic mask if it had one."""
+    name, count = source.files.name, source.n_lights if indices is None else len(indices)
+    found = source.automatic_mask is not None
+    with observer.progress(f"{name}: aligning", count * (1 + found)) as advance:
+        source = source.align(indices, lambda: advance(1))
+        if found:
+            source = replace(source, automatic_mask=None).find_mask(lambda: advance(1))
+    return source
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:

@@ -147,6 +147,8 @@ class Reading(Record, frozen=True, kw_only=True):
         "Read this box of the images: left upper corner and size in pixels.")] = None
     scale: Annotated[str | None, Option("Input", "1/N", "Read every N-th row and column, for a first look.",
         default="all")] = None
+    align: Annotated[bool, Option("Input", "",
+        "Align images that were shifted, rotated or zoomed between exposures to the first one.")] = False
     ground_truth: Annotated[FileName | None, Option("Input", "FILE",
         "True normals to compare with (.mat, .npy, text, PNG, TIFF).")] = None
     transfer: Annotated[str, Option("Input", "CURVE",

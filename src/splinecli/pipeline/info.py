@@ -20,7 +20,7 @@ from splinecli.errors import InputError, UsageError
 from splinecli.methods.estimator import student_sizes
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, infer_bytes
+from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, align, infer_bytes
 from splinecli.pipeline.infer_options import Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
@@ -70,6 +70,8 @@ def describe_capture(
         if auto_mask:
             with observer.progress("finding the object", source.n_lights) as advance:
                 source = source.find_mask(lambda: advance(1))
+        if reading.align:
+            source = align(source, None, observer)
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
                 raise UsageError(

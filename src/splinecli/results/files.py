@@ -17,7 +17,14 @@ from splinecli import __version__
 from splinecli.capture import Capture
 from splinecli.capture.light_files import rows_text
 from splinecli.capture.record import name_reading
-from splinecli.documents import Distillation, EstimateReport, NearLampsReport, UsedWeights, WarningReport
+from splinecli.documents import (
+    AlignmentReport,
+    Distillation,
+    EstimateReport,
+    NearLampsReport,
+    UsedWeights,
+    WarningReport,
+)
 from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
 from splinecli.output_files import (
     ERROR_MAP,
@@ -50,12 +57,14 @@ def report_of(
     *,
     light_file: Path | None,
     distillation: Mapping[str, Any] | None = None,
+    alignment: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
     write_estimate adds `seconds`, `folder` and `files`. The options are the options of `infer` as JSON values. `inputs`
     is a digest that changes when an input file changes. `light_file` is None if the lights were estimated from the
     images. `distillation` is the result of DistilledEstimator.report, or None if the method estimated every pixel.
+    `alignment` is the result of AlignedImages.as_dict, or None.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
@@ -89,6 +98,7 @@ def report_of(
         reading=name_reading(as_stored=options["as_stored"]),
         white_level=capture.white_level,
         removed_blur=None if capture.removed_blur is None else round(capture.removed_blur, 2),
+        alignment=None if alignment is None else convert(alignment, AlignmentReport),
         surface=None,
     ).as_dict()
 
