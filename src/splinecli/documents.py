@@ -142,6 +142,13 @@ class Report(EstimateReport):
     file_sizes: dict[str, Natural]
 
 
+class LevelReport(Document):
+    """The slope that was removed: its direction in x and y, and its angle."""
+
+    slopes: tuple[float, float]
+    tilt_deg: NotNegative
+
+
 class SurfaceReport(SurfaceFacts):
     """surface.json, and the document of integrate --json."""
 
@@ -149,6 +156,8 @@ class SurfaceReport(SurfaceFacts):
     normals: str
     colours: str | None
     prior: str | None
+    level: LevelReport | None
+    pixel_aspect: Positive
     n_pixels: Natural
     image_size: ImageSize
     seconds: NotNegative

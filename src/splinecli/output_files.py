@@ -6,7 +6,7 @@ pictures are not read as photographs. Functions are given by name, because their
 
 from dataclasses import dataclass
 
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.surface.surface_files import LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 
 NORMALS = {
     "png": "normals.png",
@@ -143,6 +143,7 @@ def own_files() -> list[str]:
         ERROR_MAP,
         *(name for row in MAPS.values() for name in row.files.values()),
         *file_names(tuple(SURFACE_FILES)),
+        *LEVEL_NORMALS,
         SURFACE_REPORT,
         FOUND_MASK,
         PAGE,

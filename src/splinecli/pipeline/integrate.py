@@ -17,17 +17,23 @@ from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.documents import SurfaceFacts, Unit
-from splinecli.errors import InputError, SplinecliError
-from splinecli.maths.normals import Convention
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.maths.normals import Convention, encode_picture
+from splinecli.maths.normals import unit as unit_vectors
 from splinecli.output_files import BYTES_OF_SURFACE, MAPS, NORMALS, REPORT
+from splinecli.pictures.maps import encode_png
 from splinecli.pipeline.infer_options import check_pixel_size
 from splinecli.pipeline.options import IntegrateOptions
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
+from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
 from splinecli.surface.mesh import decimated_mesh, surface_mesh
 from splinecli.surface.pixel_grid import focal_length, ray_basis
 from splinecli.surface.surface_files import (
+    LEVEL_MAP,
+    LEVEL_NORMALS,
+    LEVEL_PICTURE,
     SURFACE_FILES,
     SURFACE_REPORT,
     Surface,
@@ -53,6 +59,8 @@ def make_surface(
     pixel_size_mm: float | None = None,
     prior: NDArray[np.floating] | None = None,
     prior_detail: float | None = None,
+    level: tuple[tuple[int, int], ...] | None = None,
+    pixel_aspect: float = 1.0,
     progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and its entry in the reports.
@@ -60,12 +68,17 @@ def make_surface(
     The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. Without
     `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on the object and gives a
     surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean depth. The prior is in
-    the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is not needed.
+    the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is not needed. `level` is
+    as in plane_slopes, or None; like a height of the pixels other than their width, it raises UsageError with a camera
+    matrix.
     """
+    if camera_matrix is not None and (level is not None or pixel_aspect != 1):
+        problem = "--level and --pixel-aspect need an orthographic camera, but there is a camera matrix"
+        raise UsageError(problem, hint="Its fx and fy describe the pixels; level the surface elsewhere")
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
-        normal_map,
+        normal_map if pixel_aspect == 1 else _stretched(normal_map, mask, pixel_aspect),
         mask,
         camera_matrix,
         discontinuity=discontinuity,
@@ -73,11 +86,18 @@ def make_surface(
         prior_detail=prior_detail,
         progress=progress,
     )
+    slopes = level_map = None
+    if level is not None:
+        slopes = plane_slopes(depth, level, aspect=pixel_aspect)
+        depth = level_heights(depth, slopes, aspect=pixel_aspect)
+        normal_map = level_map = level_normals(normal_map, mask, slopes)
     surface = depth, mask, camera_matrix, colours
     if n_triangles is None:
         mesh = surface_mesh(*surface, normal_map=normal_map, largest_step=largest_step)
     else:
         mesh = decimated_mesh(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
+    if pixel_aspect != 1:
+        mesh = replace(mesh, vertices=mesh.vertices * np.array((1, pixel_aspect, 1), np.float32))
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit: Unit = "pixel" if camera_matrix is None else "mean depth"
     millimetres = 1 / pixel
@@ -97,7 +117,18 @@ def make_surface(
         normal_texture=mesh.normal_texture is not None,
         discontinuity=discontinuity,
     )
-    return Surface(depth, mesh, unit, millimetres), report.as_dict()
+    found = report.as_dict()
+    if slopes is not None:
+        tilt_deg = math.degrees(math.atan(math.hypot(*slopes)))
+        found["level"] = {"slopes": [round(slope, 6) for slope in slopes], "tilt_deg": round(tilt_deg, 4)}
+    return Surface(depth, mesh, unit, millimetres, level_map), found
+
+
+def _stretched(normal_map: NDArray[np.float32], mask: NDArray[np.bool_], aspect: float) -> NDArray[np.float32]:
+    """Return the normals of a surface whose height per row of pixels is that of square pixels."""
+    stretched = np.zeros_like(normal_map)
+    stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))
+    return stretched
 
 
 def view_of_report(
@@ -185,6 +216,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             pixel_size_mm=pixel_size,
             prior=prior,
             prior_detail=options.prior_detail,
+            level=options.level,
+            pixel_aspect=options.pixel_aspect,
             progress=advance,
         )
     report = {
@@ -192,6 +225,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "normals": str(options.normals),
         "colours": None if picture is None else str(picture),
         "prior": None if options.prior is None else str(options.prior),
+        "level": None,
+        "pixel_aspect": options.pixel_aspect,
         "n_pixels": n_pixels,
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
@@ -199,6 +234,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as new:
         for name, content in encode_surface(surface, options.formats):
             new.write(name, content)
+        if surface.level_normals is not None:
+            new.write(LEVEL_MAP, surface.level_normals)
+            new.write(LEVEL_PICTURE, encode_png(encode_picture(surface.level_normals, mask)))
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
         report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
@@ -219,7 +257,7 @@ def _earlier_files(folder: Path) -> list[str]:
     """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer` are kept."""
     try:
         named = read_json(folder / SURFACE_REPORT)["files"]
-        return [name for name in file_names(tuple(SURFACE_FILES)) if name in named]
+        return [name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 

@@ -42,7 +42,7 @@ from splinecli.pipeline.infer_options import (
 )
 from splinecli.records import Count, FileName, Natural, NotNegative, Option, Positive, Record, Seed, listed
 from splinecli.surface.bilateral_equations import DISCONTINUITY
-from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.surface.surface_files import DEFAULT_FORMATS, LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.training import defaults
 
 DEFAULT_TRIALS = 100
@@ -111,6 +111,20 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
                 )
 
 
+def parse_level(text: str) -> tuple[tuple[int, int], ...]:
+    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane". Raises UsageError."""
+    if text.strip() == "plane":
+        return ()
+    try:
+        points = tuple((int(x), int(y)) for x, y in (point.split(",") for point in text.split()))
+        if len(points) >= 3:
+            return points
+    except ValueError:
+        pass
+    hint = "Put quotation marks around the points"
+    raise UsageError(f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"', hint=hint)
+
+
 class IntegrateOptions(Display, frozen=True, kw_only=True):
     """The options of `integrate`."""
 
@@ -124,6 +138,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     pixel_size: Annotated[Annotated[float, Meta(ge=SMALLEST_PIXEL_MM, le=LARGEST_PIXEL_MM)] | None, Option("Input",
         "MM", "Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres.",
         default="that of infer --surface, by report.json beside the normal map, or in pixels")] = None
+    pixel_aspect: Annotated[Annotated[float, Meta(ge=0.01, le=100)], Option("Input", "A",
+        "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled images.")] = 1.0
     convention: Annotated[Convention | None, Option("Input", "",
         "Green channel of a normal map of colours: opengl is y up, directx is y down.",
         default="as in report.json beside it, or opengl")] = None
@@ -139,6 +155,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         "With --prior: shapes narrower than this come from the normals.", default="15 % of the object's size")] = None
     largest_step: Annotated[NotNegative | None, Option("Method", "PIXELS",
         "Leave out triangles whose corners differ by more than this height.", default="keep all")] = None
+    level: Annotated[tuple[tuple[int, int], ...] | None, Option("Method", "plane|POINTS",
+        "Level the surface, and write its normals: plane removes the slope of the plane that most pixels are near;"
+        ' three or more pixels "X,Y X,Y X,Y" are on a plane that becomes level.', parse=parse_level)] = None
     output: Annotated[Path | None, Option("Output", "OUT", "Folder of the results.", default="that of NORMALS",
         names=OUTPUT)] = None
     formats: Annotated[tuple[str, ...], Option("Output", "LIST",
@@ -153,6 +172,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         super().__post_init__()
         if self.prior_detail is not None and self.prior is None:
             raise UsageError("--prior-detail needs --prior")
+        if self.decimate is not None and self.pixel_aspect != 1:
+            raise UsageError("--decimate needs square pixels, so it contradicts --pixel-aspect")
 
     @property
     def folder(self) -> Path:
@@ -162,7 +183,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     @property
     def files(self) -> tuple[str, ...]:
         """The names of the files that may be written."""
-        return (*file_names(self.formats), SURFACE_REPORT)
+        levelled = () if self.level is None else LEVEL_NORMALS
+        return (*file_names(self.formats), *levelled, SURFACE_REPORT)
 
 
 def parse_light_count(text: str) -> int | None:

@@ -35,6 +35,7 @@ SURFACE_FILES = {
 }
 """The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
 
+LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = "level_normals.npy", "level_normals.png"  # of `integrate --level`
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 DEFAULT_MESHES = ("glb", "ply")
 DEPTH_FORMATS = ("npy", "tiff", "png")
@@ -51,6 +52,7 @@ class Surface:
     mesh: SurfaceMesh  # the mesh of the same surface
     unit: str  # the name of the unit of both
     millimetres: float  # the length of this unit in a file of glTF
+    level_normals: NDArray[np.float32] | None = None  # (H, W, 3), the normals of a surface that was levelled
 
 
 def file_names(formats: Sequence[str]) -> tuple[str, ...]:

@@ -1,0 +1,68 @@
+"""Level a surface: remove the slope of its main plane, or of a plane through points, from heights and normals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splinecli.errors import UsageError
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
+from splinecli.maths.normals import unit
+
+_FITS = 50
+_CUT = 2.5  # residuals have half of their weight at so many robust standard deviations
+_AROUND = 2  # pixels around a given point whose median height is taken
+
+
+def plane_slopes(
+    heights: Floats, points: Sequence[tuple[int, int]] = (), *, aspect: float = 1.0
+) -> tuple[float, float]:
+    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y is up.
+
+    Args:
+        points: columns and rows of at least three points on the plane, or () for the plane that most pixels are near
+            (iteratively reweighted least squares with Cauchy's weights).
+        aspect: height of a pixel in widths, the unit of the heights.
+
+    Raises:
+        UsageError: a point is not on the object, or the points lie in a line.
+    """
+    if points:
+        values = []
+        for x, y in points:
+            around = heights[max(0, y - _AROUND) : y + _AROUND + 1, max(0, x - _AROUND) : x + _AROUND + 1]
+            if not (0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]) or not np.isfinite(heights[y, x]):
+                raise UsageError(f"--level has the point {x},{y}, which is not on the object")
+            values.append(float(np.nanmedian(around)))
+        columns, rows = np.array(points, np.float64).T
+        z = np.array(values)
+    else:
+        rows, columns = np.nonzero(np.isfinite(heights))
+        z = heights[rows, columns].astype(np.float64)
+    terms = np.stack((columns - columns.mean(), (rows.mean() - rows) * aspect, np.ones(len(z))), axis=1)
+    sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
+    if sizes[-1] < 1e-2 * sizes[0]:
+        raise UsageError("--level: the points lie in a line", hint="Choose points that are spread in x and y")
+    weights, plane = np.ones(len(z)), terms[0]
+    for _ in range(1 if points else _FITS):
+        weighted = terms * weights[:, None]
+        plane = np.linalg.lstsq(weighted.T @ terms, weighted.T @ z, rcond=None)[0]
+        left = np.abs(z - terms @ plane)
+        weights = 1 / (1 + (left / max(_CUT * 1.4826 * float(np.median(left)), 1e-9)) ** 2)
+    return float(plane[0]), float(plane[1])
+
+
+def level_heights(heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0) -> Float64Array:
+    """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the object."""
+    rows, columns = np.indices(heights.shape)
+    plane = slopes[0] * columns - slopes[1] * aspect * rows
+    return np.asarray(heights - (plane - plane[np.isfinite(heights)].mean()), np.float64)
+
+
+def level_normals(normal_map: Floats, mask: Bools, slopes: tuple[float, float]) -> Float32Array:
+    """Return the normals (H, W, 3) of the levelled surface; zero outside the mask."""
+    levelled = np.zeros(normal_map.shape, np.float32)
+    x, y, z = normal_map[mask].astype(np.float64).T
+    levelled[mask] = unit(np.stack((x + slopes[0] * z, y + slopes[1] * z, z), axis=1))
+    return levelled
