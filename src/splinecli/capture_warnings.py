@@ -176,6 +176,11 @@ LIGHT_ORDER = WarningKind(
 LIGHTS_ILL_CONDITIONED = WarningKind(
     "lights_ill_conditioned", "The lights determine the normals badly", "Add lights from other sides"
 )
+LIGHTS_IN_CHANNELS = WarningKind(
+    "lights_in_channels",
+    "Each channel of the images counts as a light, as `--lights-in-channels` asks; coloured objects get wrong normals",
+    "A [crosstalk matrix](coloured-lights.md), and gray objects",
+)
 LIGHTS_MATCHED = WarningKind(
     "lights_matched",
     "Lights were matched to images by another rule than the full name",

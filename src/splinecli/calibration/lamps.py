@@ -55,7 +55,7 @@ def measure_light_intensities(
     if len(files.images) != n_lights:
         problem = f"found {len(files.images)} images, expected {n_lights}, one for each light"
         raise InputError(problem, path=files.folder)
-    mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
+    mask, normals = target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
     capture = CaptureSource(
         CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
@@ -88,7 +88,7 @@ def measure_light_intensities(
     return np.asarray(intensities / intensities.mean())
 
 
-def _target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Float64Array]:
+def target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Float64Array]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
     mask = np.ones(shape, np.bool_)
     if files.mask is not None:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splinecli import capture_warnings as codes
-from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_files
+from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
+from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_content, stamp_files
 from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import NamedLights, read_light_intensities, read_lights, unit_directions
@@ -61,6 +62,8 @@ def open_capture(
     lamps: LampOptions = NO_LAMP_OPTIONS,
     window: Window = WHOLE,
     find_lights: LightFinder | None = None,
+    lights_in_channels: bool = False,
+    crosstalk: StrPath | None = None,
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -75,6 +78,8 @@ def open_capture(
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: positions of near lamps, and the camera, unless files in the folder give them.
         find_lights: estimates the lights from the images, instead of reading light files.
+        lights_in_channels: whether the channels of each image are observations under three lights; see ChannelLights.
+        crosstalk: a file with their crosstalk, instead of that in the folder.
 
     Raises:
         InputError: find_capture_files does not recognise the folder, a light file is wrong, or the window is not inside
@@ -101,7 +106,14 @@ def open_capture(
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
     camera_matrix, of_camera = find_camera(Path(folder), near, lamps)
+    channels, matrix_file = None, None
+    if lights_in_channels:
+        matrix_file = Path(crosstalk) if crosstalk is not None else find_named(files.folder, (CROSSTALK,))
+        channels = channel_lights(matrix_file, len(files.images))
     stamp = stamp_files(files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera))
+    if channels is not None:
+        stamp = (*stamp, None if matrix_file is None else stamp_content(matrix_file))
+        files = replace(files, images=tuple(image for image in files.images for _ in range(CHANNELS)))
     in_folder = files.images
     files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
     warnings += files.warnings
@@ -111,7 +123,13 @@ def open_capture(
     if equal:
         found_intensities = None
     elif files.light_intensities is not None:
-        found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
+        if channels is None:
+            found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
+        else:  # a line r g b for each image
+            of_images = read_light_intensities(files.light_intensities, len(files.images) // CHANNELS)
+            found_intensities = np.repeat(of_images.reshape(-1, 1), 3, axis=1)
+    if channels is not None:
+        warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
     if files.light_directions is not None and form == "xyz" and near is None:
         warnings += positions_as_directions(files.light_directions)
     facts = tuple(map(read_header, files.images))
@@ -153,6 +171,7 @@ def open_capture(
         light_numbers=files.kept,
         lamps=near,
         camera_matrix=camera_matrix,
+        channels=channels,
         window=window.on(facts[0]),
         find_lights=find_lights,
         # Omitted if they are not given, so that earlier stamps stay valid.

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from splinecli.capture.channel_lights import ChannelLights
 from splinecli.capture.files import CaptureFiles
 from splinecli.capture.formats.decoders import stderr_is_apart
 from splinecli.capture.formats.facts import ImageHeader, StoredSize
@@ -91,6 +92,7 @@ class CaptureSource:
     light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # the near lamps of files and options, or None
     camera_matrix: Float64Array | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
+    channels: ChannelLights | None = None  # if each channel of a colour image counts as an image of its own
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
     # JSON values that change when a file that is read for the capture, or the given white level, does. They are taken
@@ -337,7 +339,11 @@ class CaptureSource:
 
         def read(index: int) -> Item:
             facts, intensity = self.facts[index], self.light_intensities[index]
-            return use(StoredPixels(facts.path, *pixels_of(facts.path, index), intensity, facts.white_level))
+            pixels = pixels_of(facts.path, index)
+            if self.channels is not None:
+                number = index if self.light_numbers is None else self.light_numbers[index]
+                pixels = self.channels.observe(facts.path, *pixels, number)
+            return use(StoredPixels(facts.path, *pixels, intensity, facts.white_level))
 
         for item in read_ahead(read, indices):
             yield item

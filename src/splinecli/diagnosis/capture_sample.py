@@ -64,7 +64,8 @@ class CaptureSample:
         (sample, closeup), lamps = samples, source.lamps
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
-            copies = equal_files(images) if page_of(images[0])[0] == images[0] else []
+            single = page_of(images[0])[0] == images[0] and source.channels is None
+            copies = equal_files(images) if single else []
         return cls(
             [image.name for image in images],
             source.light_directions,

@@ -5,7 +5,15 @@ from typing import Any
 
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.lamps import calibration_report, measure_light_intensities, summary_lines, triangulate_lamps
+from splinecli.calibration.crosstalk import measure_crosstalk
+from splinecli.calibration.lamps import (
+    Target,
+    calibration_report,
+    measure_light_intensities,
+    summary_lines,
+    triangulate_lamps,
+)
+from splinecli.capture.channel_lights import CROSSTALK
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
@@ -19,7 +27,7 @@ from splinecli.system.publishing import held_folder, new_files
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = CALIBRATION, "calibration.json"
-OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
+OUTPUT_FILES = (DIRECTIONS, INTENSITIES, CROSSTALK, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -50,21 +58,26 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
             for ball, circle in zip(balls, circles, strict=True)
         ]
     lights = combine_balls(calibrated)
-    intensities = None
+    intensities = crosstalk = None
     warnings: list[str] = []
     if target_files is not None:
         radiometry = RadiometricCalibration(parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC)
         radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
         warnings = [f"{target}: {warning}" for warning in of_curve]
-        intensities = measure_light_intensities(
-            target_files, lights.directions, "ball" if options.gray_ball is not None else "card", radiometry=radiometry
-        )
+        if options.lights_in_channels:
+            crosstalk = measure_crosstalk(target_files, lights.directions, radiometry=radiometry)
+        else:
+            shape: Target = "ball" if options.gray_ball is not None else "card"
+            intensities = measure_light_intensities(target_files, lights.directions, shape, radiometry=radiometry)
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     report["warnings"] += warnings
+    report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
     texts = {DIRECTIONS: rows_text(lights.directions), REPORT: json.dumps(report, indent=2) + "\n"}
     if intensities is not None:
         texts[INTENSITIES] = rows_text(intensities)
+    if crosstalk is not None:
+        texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
     if lamps is not None and lamps.known:
         texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
         if lamps.view.known:
@@ -78,6 +91,8 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
         observer.say(line)
     if intensities is not None:
         observer.say(f"The light intensities are in {options.output / INTENSITIES}")
+    if crosstalk is not None:
+        observer.say(f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels")
     if lamps is not None and lamps.known:
         observer.say(f"The positions of the lamps are in {options.output / POSITIONS}, for --light-positions")
     for warning in report["warnings"]:

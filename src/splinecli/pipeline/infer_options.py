@@ -176,6 +176,12 @@ class Reading(Record, frozen=True, kw_only=True):
     intensities: Annotated[FileName | None, Option("Lights", "FILE|equal",
         "Light intensities: a line r g b for each image.",
         default="equal, or estimated if the images show that they differ")] = None
+    lights_in_channels: Annotated[bool, Option("Lights", "",
+        "The channels of each colour image are photographs under three coloured lamps; the light file has three lights"
+        " for each image, in the order R, G, B. For gray objects.")] = False
+    crosstalk: Annotated[FileName | None, Option("Lights", "FILE",
+        "With --lights-in-channels: 3 x 3 responses, line by line those of the channels R, G, B to the lamps.",
+        default="crosstalk.txt in CAPTURE, or none")] = None
     light_positions: Annotated[FileName | None, Option("Lights", "FILE",
         "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
         default="light_positions.txt in CAPTURE")] = None
@@ -207,6 +213,10 @@ class Reading(Record, frozen=True, kw_only=True):
                     f"--lights estimate {reason}, so it contradicts {option}",
                     hint=f"Leave {option} out, or give a light file",
                 )
+        if self.crosstalk is not None and not self.lights_in_channels:
+            raise UsageError("--crosstalk needs --lights-in-channels", hint="Add it, or leave both out")
+        if self.lights_in_channels and self.align:
+            raise UsageError("--lights-in-channels and --align contradict each other", hint="Leave one out")
         if self.first_light is not None and not self.finds_lights:
             raise UsageError("--first-light needs --lights estimate", hint="Add it, or leave both out")
         if self.first_light is not None:
@@ -242,7 +252,7 @@ class Reading(Record, frozen=True, kw_only=True):
     def check_files(self) -> None:
         """Raise InputError if a file named in the options does not exist, or --flat-field contains no images."""
         intensities = None if self.intensities == EQUAL else self.intensities
-        named = (self.light_file, self.light_positions, intensities, self.camera_matrix, self.mask)
+        named = (self.light_file, self.light_positions, intensities, self.camera_matrix, self.mask, self.crosstalk)
         for name in (*named, self.ground_truth, self.ambient):
             if name is not None:
                 check_file(Path(name), "a file", pipe=name == self.light_file)
@@ -279,6 +289,8 @@ class Reading(Record, frozen=True, kw_only=True):
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
             find_lights=find,
+            lights_in_channels=self.lights_in_channels,
+            crosstalk=self.crosstalk,
         )
 
 

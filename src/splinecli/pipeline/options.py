@@ -81,6 +81,9 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
         "Images of a matte gray ball under the same lights.")] = None
     gray_card: Annotated[Path | None, Option("Light intensities", "DIR",
         "Images of a matte gray card that faces the camera.")] = None
+    lights_in_channels: Annotated[bool, Option("Light intensities", "",
+        "The images of the gray ball are colour images under three coloured lamps at once: measure their crosstalk."
+        " BALL has an image under each lamp alone, in the order R, G, B.")] = False
     transfer: Annotated[str, Option("Light intensities", "CURVE",
         "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.", complete=CURVES)] = AUTOMATIC
     compare: Annotated[Path | None, Option("Output", "FILE",
@@ -100,6 +103,8 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
                 "--ball-diameter needs two balls or more",
                 hint="Photograph a second ball, or the same ball at another place: one ball gives no positions",
             )
+        if self.lights_in_channels and not self.gray_ball:
+            raise UsageError("--lights-in-channels needs --gray-ball", hint="Photograph a matte gray or white ball")
         if self.gray_ball and self.gray_card:
             raise UsageError("--gray-ball and --gray-card contradict each other", hint="Leave one out")
         for option, values in (("--circle", self.circles), ("--mask", self.masks)):

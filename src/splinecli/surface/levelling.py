@@ -44,19 +44,20 @@ def plane_slopes(
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] < 1e-2 * sizes[0]:
         raise UsageError("--level: the points lie in a line", hint="Choose points that are spread in x and y")
-    weights, plane = np.ones(len(z)), terms[0]
+    weights, right, up = np.ones(len(z)), 0.0, 0.0
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]
-        plane = np.linalg.lstsq(weighted.T @ terms, weighted.T @ z, rcond=None)[0]
-        left = np.abs(z - terms @ plane)
+        matrix, sides = weighted.T @ terms, weighted.T @ z
+        right, up, offset = (float(value) for value in np.linalg.inv(matrix) @ sides)
+        left = np.abs(z - terms @ np.array((right, up, offset)))
         weights = 1 / (1 + (left / max(_CUT * 1.4826 * float(np.median(left)), 1e-9)) ** 2)
-    return float(plane[0]), float(plane[1])
+    return right, up
 
 
 def level_heights(heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0) -> Float64Array:
     """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the object."""
     rows, columns = np.indices(heights.shape)
-    plane = slopes[0] * columns - slopes[1] * aspect * rows
+    plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)
     return np.asarray(heights - (plane - plane[np.isfinite(heights)].mean()), np.float64)
 
 

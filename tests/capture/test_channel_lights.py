@@ -1,0 +1,101 @@
+"""Three coloured lamps at once: gray spheres whose crosstalk and normals are known."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scenes import ring_lights, shade, sphere, write_capture
+from splinecli.calibration.balls import find_ball_files
+from splinecli.calibration.crosstalk import measure_crosstalk
+from splinecli.capture.channel_lights import channel_lights
+from splinecli.errors import InputError, UsageError
+from splinecli.maths.normals import angle_between_deg
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
+
+Floats = NDArray[np.float64]
+NORMALS, MASK = sphere(90)
+LIGHTS = np.concatenate((ring_lights(3, 35), ring_lights(3, 50, 0.8)))
+CROSSTALK = np.array([[1.0, 0.2, 0.05], [0.15, 1.3, 0.2], [0.02, 0.25, 0.7]])
+
+
+def photograph(lights: Floats, crosstalk: Floats = CROSSTALK, paint: Floats | float = 1.0) -> NDArray[np.uint16]:
+    """Return colour images (N, H, W, 3) of a sphere under three lights (3 N, 3) each; `paint` has its colours."""
+    shading = shade(NORMALS, lights).reshape(*MASK.shape, -1, 3) * MASK[..., None, None]
+    images = np.moveaxis(shading, 2, 0) @ crosstalk.T * paint
+    return np.rint(images * 30_000).astype(np.uint16)
+
+
+def write(folder: Path, count: int, paint: Floats | float = 1.0) -> Path:
+    lights = LIGHTS[: 3 * count]
+    write_capture(folder, photograph(lights, paint=paint), lights, mask=MASK, normals=NORMALS.astype(np.float32))
+    np.savetxt(folder / "crosstalk.txt", CROSSTALK)
+    return folder
+
+
+def normals_of(folder: Path, out: Path, **options: Any) -> Floats:
+    options = {"method": "ls"} | options
+    infer_capture(folder, InferOptions(lights_in_channels=True, output=str(out), **options))
+    return np.asarray(np.load(out / folder.name / "normals.npy"), np.float64)
+
+
+def errors_deg(folder: Path, out: Path, lights: Floats, **options: Any) -> Floats:
+    """Return the errors where all lights reach."""
+    lit = MASK & (NORMALS @ lights.T > 0.05).all(axis=2)
+    return angle_between_deg(normals_of(folder, out, **options)[lit], NORMALS[lit])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path: Path) -> None:
+    folder = write(tmp_path / "gray", count)
+    assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
+    report = json.loads((tmp_path / "out/gray/report.json").read_text())
+    assert report["n_lights"] == 3 * count and "lights_in_channels" in [each["code"] for each in report["warnings"]]
+
+
+def test_the_networks_take_two_images(tmp_path: Path) -> None:
+    folder = write(tmp_path / "gray", 2)
+    assert errors_deg(folder, tmp_path / "out", LIGHTS, method="spline-net").mean() < 4
+
+
+def test_paint_is_taken_for_shading(tmp_path: Path) -> None:
+    folder = write(tmp_path / "red", 1, paint=np.array((1.0, 0.4, 0.4)))
+    assert errors_deg(folder, tmp_path / "out", LIGHTS[:3]).mean() > 5
+
+
+def test_the_intensities_of_the_lamps_are_divided_out(tmp_path: Path) -> None:
+    folder, uneven = tmp_path / "gray", np.diag((1.0, 1.5, 0.6))
+    write_capture(folder, photograph(LIGHTS, uneven), LIGHTS, mask=MASK)
+    np.savetxt(folder / "light_intensities.txt", np.tile(np.diag(uneven), (2, 1)))
+    assert errors_deg(folder, tmp_path / "out", LIGHTS).max() < 0.2
+
+
+def test_crosstalk_is_measured_on_a_gray_ball(tmp_path: Path) -> None:
+    write_capture(tmp_path / "ball", photograph(LIGHTS), None, mask=MASK)
+    found = measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS)
+    expected = CROSSTALK / np.trace(CROSSTALK) * 3
+    assert found == pytest.approx(np.stack((expected, expected)), abs=0.02)
+    with pytest.raises(InputError, match="2 colour images of the gray ball and 3 lights"):
+        measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS[:3])
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "gray", 1)
+    (tmp_path / "matrix.txt").write_text("1 1 1\n1 1 1\n1 1 1.1\n")
+    with pytest.raises(InputError, match="do not separate the lamps"):
+        channel_lights(tmp_path / "matrix.txt", 1)
+    (tmp_path / "matrix.txt").write_text("1 0\n0 1\n")
+    with pytest.raises(InputError, match="found 2 x 2 numbers, expected 3 x 3"):
+        normals_of(tmp_path / "gray", tmp_path / "out", crosstalk=str(tmp_path / "matrix.txt"))
+    name = str(tmp_path / "gray/000.png")
+    assert cv2.imwrite(name, cv2.imread(name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
+    with pytest.raises(InputError, match="the image is gray"):
+        normals_of(tmp_path / "gray", tmp_path / "out")
+    for options in ({"crosstalk": "matrix.txt"}, {"lights_in_channels": True, "align": True}):
+        with pytest.raises(UsageError):
+            InferOptions(**options)
