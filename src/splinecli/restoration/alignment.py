@@ -283,7 +283,7 @@ class _Fit(NamedTuple):
     root: Float64Array
     surface: Float64Array
     left: Float64Array
-    scale: Float64Array  # (P,), the residual at which an observation has half of its weight
+    scale: Float64Array  # (F, P), the residual at which an observation has half of its weight
     cost: float
 
 
@@ -336,7 +336,7 @@ class _Level:
             if cost >= fit.cost:
                 return
             self.transforms, self.lights, self.data, damping = transforms, lights, data, damping / 4
-            if motion < 0.005 or cost > (1 - 1e-4) * fit.cost:
+            if motion < 0.005 or cost > (1 - 1e-3 / len(self.images)) * fit.cost:
                 return
 
     def correlations(self) -> Float64Array:
@@ -384,9 +384,9 @@ class _Level:
             left = _matte(values, weights, lights)[2]
             sums = (weights * values**2).sum(axis=0), np.maximum(weights.sum(axis=0), 1e-6)
             energy = np.sqrt(sums[0] / sums[1]) + _SMALLEST_ENERGY
-            counted = weights > 0.3
-            shares = (np.abs(left) / energy)[counted if counted.any() else weights >= 0]
-            found = _CUT * 1.4826 * max(float(np.median(shares)), 1e-6) * energy
+            # The median of each image: an image that is still far from the others must not look like outliers.
+            shares = _medians(np.where(weights > 0.3, np.abs(left) / energy, np.nan))
+            found = _CUT * 1.4826 * np.maximum(shares, 1e-6)[:, None] * energy
             weights = lit / (1 + (left / found) ** 2)
         if scale is None:
             scale, weights = found, lit
@@ -435,8 +435,9 @@ class _Level:
     ) -> tuple[Float64Array, Float64Array, float]:
         """Return transforms and lights after a step, and the largest motion. The first image stays."""
         count, each, free = len(self.images), self.parameters + 3, slice(self.parameters, None)
-        motion = np.tile(np.arange(each) < self.parameters, count)
-        damped = matrix + np.diag(damping * motion + 1e-9 * np.trace(matrix) / len(matrix) + 1e-12)
+        # Motions relative to their mean are damped: the others together move against the first image as one image does.
+        motion = np.kron(np.eye(count) - 1 / count, np.diag(np.arange(each) < self.parameters))
+        damped = matrix + damping * motion + np.eye(len(matrix)) * (1e-9 * np.trace(matrix) / len(matrix) + 1e-12)
         step = np.zeros(len(gradient))
         step[free] = -np.linalg.solve(damped[free, free], gradient[free])
         steps = step.reshape(count, each)
@@ -462,6 +463,12 @@ _GENERATORS = np.array(
     np.float64,
 )
 """Small motions of points of the plane as matrices: shifts, rotation, scale, two shears, and two of perspective."""
+
+
+def _medians(shares: Float64Array) -> Float64Array:
+    """Return the medians (F,) of shares (F, P) without NaN; that of all where there are none."""
+    usual = float(np.nanmedian(shares)) if not np.isnan(shares).all() else 1.0
+    return np.array([np.nanmedian(row) if not np.isnan(row).all() else usual for row in shares])
 
 
 def _matte(values: Floats, weights: Floats, lights: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
