@@ -241,6 +241,7 @@ WRITERS = {
     "12-bit PGM": lambda folder: [write_pnm(folder / f"{n}", PICTURES[n] >> 4, 4095) for n in range(12)],
     "PPM": lambda folder: [picture(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)],
     "stack": write_stack,
+    "LZW stack": lambda folder: cv2.imwritemulti(str(folder / "stack.tif"), list(PICTURES)),  # OpenCV's TIFF is LZW
 }  # fmt: skip
 
 
@@ -255,7 +256,7 @@ def test_images_of_other_formats(folder: Path, form: str) -> None:
     check(source)
     if form == "12-bit PGM":
         assert source.facts[0].white_level == 4095
-    if form == "stack":
+    if form in ("stack", "LZW stack"):
         assert source.files.images[3].name == "stack.tif[3]"
         assert check_sample(CaptureSample.of_source(source, summarise_capture(source).samples, range(12)))[1] == []
 

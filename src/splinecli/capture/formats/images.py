@@ -175,9 +175,6 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         pixels = decode_tiff(file, path)
         if pixels is not None:
             return pixels
-        if page_of(path)[1]:  # OpenCV reads the first page
-            hint = "Save it without compression, or each page as a file"
-            raise InputError("this page of the TIFF cannot be decoded", path=path, hint=hint)
         file.seek(0)
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
@@ -192,17 +189,22 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(dtype[-2:])
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)
-    return _decode_with_opencv(data)
+    return _decode_with_opencv(data, page_of(path)[1])
 
 
-def _decode_with_opencv(data: bytes) -> Array:
-    """Return pixels (H, W) or (H, W, C), in RGB or RGBA order. Raises ValueError or cv2.error for a damaged file."""
+def _decode_with_opencv(data: bytes, page: int) -> Array:
+    """Return a page's pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error for a damaged file."""
     import cv2
 
     with native_stderr() as messages:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
-            pixels: Array | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            content, pixels = np.frombuffer(data, np.uint8), None
+            if page:
+                _, found = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
+                pixels = found[0] if found else None
+            else:
+                pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             if error.code == cv2.Error.StsNoMem:
                 raise MemoryError from None
