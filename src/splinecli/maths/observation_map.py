@@ -65,7 +65,7 @@ def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
     """
     if grid == "even":
         return cell_directions(size)[1]
-    doubled = 2 * torch.arange(size) - (size - 1)
+    doubled = 2 * torch.arange(size, device="cpu") - (size - 1)
     return doubled[:, None] ** 2 + doubled**2 < (size - 1) ** 2
 
 

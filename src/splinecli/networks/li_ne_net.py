@@ -277,7 +277,7 @@ class CompactNENet(nn.Module):
             self.weigh = nn.Linear(head_width, fits + 1)
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
-                self.weigh.bias.copy_(torch.arange(fits + 1) == 0)
+                self.weigh.bias.zero_()[0] = 1
         self.join = nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
         self.error_head = ErrorHead(head_width, fits + 2) if config.error_head else None
 
