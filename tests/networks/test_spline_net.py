@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor
+from torch import Tensor, nn
 
 from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.li_ne_net import error_negative_log_likelihood, probability_within
+from splinecli.networks.li_ne_net import MapEncoder, error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from tiny_networks import TINY, random_network
@@ -156,3 +156,15 @@ def test_it_changes_no_normal() -> None:
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
     torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("n_maps", [1, 300])
+def test_few_products_give_the_features_of_the_convolutions(n_maps: int) -> None:
+    encoder = MapEncoder(3, 24, 2, 16)
+    for parameter in encoder.parameters():
+        nn.init.normal_(parameter, std=0.1)
+    maps = torch.rand(n_maps, 3, 16, 16)
+    with torch.no_grad():
+        found = encoder(maps)
+        expected = encoder.double()(maps.double())
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)

@@ -105,6 +105,7 @@ class _MatteModel:
     ) -> None:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
+        self._found: dict[int, _Compared | None] = {}  # of this fit
         self.reach = max(2, round(LIMITS.reach * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
         self._values = images[:, mask].T.copy()
         self._known = np.zeros(self._values.shape, np.bool_)
@@ -119,6 +120,7 @@ class _MatteModel:
         self._fit()
 
     def _fit(self) -> None:
+        self._found.clear()
         known = self._values * self._known
         bright = int(self._known.any(axis=0).sum()) // 8  # highlights: the brightest eighth of the images
         self._top = np.maximum(np.partition(known, -1 - bright, axis=1)[:, -1 - bright], 1e-12)
@@ -140,6 +142,11 @@ class _MatteModel:
         return np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 4.0, normals, 0.0)
 
     def _compared(self, place: int) -> _Compared | None:
+        if place not in self._found:
+            self._found[place] = self._compare(place)
+        return self._found[place]
+
+    def _compare(self, place: int) -> _Compared | None:
         """Return how the model fits an image at all shifts; None if it does not apply to this image.
 
         Shadows and highlights of the image are left out, but not pixels that are dark although the model predicts
@@ -153,7 +160,7 @@ class _MatteModel:
             return None
         good, scaled = self._map(np.asarray(normals.any(axis=1))), self._map(normals * self._top[:, None])
         kept, image = self._map(kept), self._map(image * kept)
-        products = np.stack([scaled[row] * scaled[column] for row in range(3) for column in range(3)])
+        products = np.stack([scaled[row] * scaled[column] for row, column in zip(*np.triu_indices(3), strict=True)])
         overlap = self._sums(good, kept)
         left = _residual(overlap, self._sums(products, kept), self._sums(scaled, image), self._sums(good, image**2))
         unmoved = _residual(  # in the pixels that the moved image covers
@@ -255,9 +262,9 @@ def _least(
 def _residual(count: Float64Array, products: Float64Array, sums: Float64Array, squares: Float64Array) -> Float64Array:
     """Return root mean square residuals at each shift (h, w) of a fit with the best light.
 
-    From the sums over pixels of scaled normals times each other (9, h, w), and of images times these (3, h, w).
+    From the sums over pixels of scaled normals times each other (6, h, w), and of images times these (3, h, w).
     """
-    matrices = np.moveaxis(products.reshape(3, 3, *count.shape), (0, 1), (-2, -1))
+    matrices = np.moveaxis(products[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], (0, 1), (-2, -1))
     trace = np.trace(matrices, axis1=-2, axis2=-1)
     matrices = matrices + (1e-6 * trace + 1e-12)[..., None, None] * np.eye(3)
     sides = np.moveaxis(sums, 0, -1)

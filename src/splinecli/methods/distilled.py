@@ -2,7 +2,7 @@
 
 One capture has one set of lights and a few materials, so most of its pixels are redundant. Under near lamps, the lights
 change smoothly over the image. The network estimates a sample of the pixels, and the perceptron learns from this sample
-and estimates the rest about 80 times as fast. The part that the perceptron does not follow is mostly the network's
+and estimates the rest over 100 times as fast. The part that the perceptron does not follow is mostly the network's
 noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
@@ -336,8 +336,8 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False), torch.enable_grad():
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        # At most 1 % of the pixels, and twice the sample, are of rare kinds and go through the network.
-        rare_share = min(0.01, 2 * size.sample / n_pixels)
+        # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through the network.
+        rare_share = min(0.005, size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         pixels = sample.rows.numpy()
         taught = teacher.estimate_with_error(candidates[pixels], directions_at(directions, pixels), progress=progress)

@@ -43,7 +43,7 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
-    return StudentSize(usual, max(500, usual // 10), 192), StudentSize(larger, max(500, larger // 10), 320)
+    return StudentSize(usual, max(500, usual // 10), 128), StudentSize(larger, max(500, larger // 10), 256)
 
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
