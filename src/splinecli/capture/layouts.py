@@ -10,27 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from splinecli.capture.files import (
-    FILENAMES,
-    GROUND_TRUTH,
-    IMAGE_FOLDERS,
-    LIGHT_INTENSITIES,
-    MASK,
-    NO_OVERRIDES,
-    NOT_PHOTOGRAPHS,
-    CaptureFiles,
-    NoImagesError,
-    Overrides,
-    check_not_empty,
-    choose_mask,
-    copies,
-    find_images,
-    find_named,
-    folder_name,
-    is_mask_name,
-    list_folder,
-    list_images,
-)
+from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
 from splinecli.capture_warnings import CaptureWarning
@@ -49,7 +29,7 @@ _USUAL_LIGHTS = [name for each in FORMATS if not each.rank for name in each.foun
 _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
-def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
     Raises InputError if a file is missing, there are several such folders, or the images do not match the lights.
@@ -66,11 +46,11 @@ def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         problem = f"found {len(captures)} folders of images ({names}), expected one"
         raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
     holder = _parent(images_folder)
-    lights = overrides.lights or find_named(holder, [_LIGHTS])
+    lights = overrides.lights or files.find_named(holder, [_LIGHTS])
     if lights is None:
         problem = f"found no {_LIGHTS}, expected the light directions of {images_folder.name}"
         raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
-    return CaptureFiles(
+    return files.CaptureFiles(
         "CyclesPS",
         _name(images_folder),
         holder,
@@ -79,7 +59,7 @@ def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         light_intensities=overrides.intensities,
         mask=overrides.mask,
         boundaries=() if overrides.mask else _find_boundaries(holder),
-        ground_truth=overrides.ground_truth or find_named(holder, GROUND_TRUTH),
+        ground_truth=overrides.ground_truth or files.find_named(holder, files.GROUND_TRUTH),
     )
 
 
@@ -94,23 +74,23 @@ def cyclesps_name(folder: Path) -> str | None:
 
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
-    is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
-    if not (is_images_folder or _has_marks(folder)) or find_named(folder, _USUAL_LIGHTS) is not None:
+    is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
+    if not (is_images_folder or _has_marks(folder)) or files.find_named(folder, _USUAL_LIGHTS) is not None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
-    captures = [entry for entry in list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    captures = [entry for entry in files.list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
     # Images beside light.txt are a plain folder, to be used with --lights light.txt.
-    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return None if not captures and list_images(folder, leave_out_stems=no_photographs) else captures
+    no_photographs = files.NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
+    return None if not captures and files.list_images(folder, leave_out_stems=no_photographs) else captures
 
 
 def _name(images_folder: Path) -> str:
-    return f"{folder_name(_parent(images_folder))}_{folder_name(images_folder).removeprefix(_PREFIX)}"
+    return f"{files.folder_name(_parent(images_folder))}_{files.folder_name(images_folder).removeprefix(_PREFIX)}"
 
 
 def _has_marks(folder: Path) -> bool:
-    marked = [entry for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
+    marked = [entry for entry in files.list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
     return len({entry.name.lower() for entry in marked}) >= _ENOUGH_MARKS
 
 
@@ -121,7 +101,7 @@ def _parent(folder: Path) -> Path:
 
 def _find_boundaries(holder: Path) -> tuple[Path, ...]:
     """Return both masks. The object is their union, so one alone would be wrong."""
-    found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
+    found = {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
     missing = [name for name, path in found.items() if path is None]
     if missing:
         problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
@@ -131,7 +111,7 @@ def _find_boundaries(holder: Path) -> tuple[Path, ...]:
 
 def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
     """Return the images 00000.tif and so on, one for each light."""
-    there = {entry.name.lower(): entry for entry in list_folder(folder)}
+    there = {entry.name.lower(): entry for entry in files.list_folder(folder)}
     wanted = [f"{index:05}.tif" for index in range(n_lights)]
     expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
     for name in wanted:
@@ -160,19 +140,19 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
     return not words.isdisjoint(_WORD.findall(image.stem.lower()))
 
 
-def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
+def find_capture_files(folder: StrPath, overrides: files.Overrides = files.NO_OVERRIDES) -> files.CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
     Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
     does not exist; the light file is missing; or a file of the overrides does not exist.
     """
     folder = Path(folder)
-    list_folder(folder)  # raises if it is not a folder
+    files.list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
         # The plain folder comes last, because it accepts any folder with images.
         return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
-    except NoImagesError as error:
+    except files.NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
             raise
@@ -188,16 +168,16 @@ def capture_name(folder: StrPath) -> str:
 
 def _own_name(folder: Path) -> str:
     """Return the name of a folder, or its parent's name if the folder is called `images`. Raises InputError."""
-    name = folder_name(folder)
-    return folder_name(_parent(folder)) if name in IMAGE_FOLDERS and _parent(folder) != folder else name
+    name = files.folder_name(folder)
+    return files.folder_name(_parent(folder)) if name in files.IMAGE_FOLDERS and _parent(folder) != folder else name
 
 
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
-    inside = next((path for name in IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None or not all(map(_is_other, list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS))):
+    inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
+    if inside is None or not all(map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))):
         return None
-    return inside if list_images(inside, leave_out_stems=NOT_PHOTOGRAPHS) else None
+    return inside if files.list_images(inside, leave_out_stems=files.NOT_PHOTOGRAPHS) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -223,17 +203,17 @@ def find_captures(folder: StrPath) -> list[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    return [entry for entry in list_folder(folder) if is_folder(entry)]
+    return [entry for entry in files.list_folder(folder) if is_folder(entry)]
 
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
-        objects = folder / IMAGE_FOLDERS[0]
-        is_psbox = is_folder(objects) and find_named(folder, PSBOX_LIGHTS) is not None
+        objects = folder / files.IMAGE_FOLDERS[0]
+        is_psbox = is_folder(objects) and files.find_named(folder, PSBOX_LIGHTS) is not None
         if (
-            find_named(folder, [FILENAMES]) is not None
-            or list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS)
+            files.find_named(folder, [files.FILENAMES]) is not None
+            or files.list_images(objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS)
             or _images_folder(folder) is not None
         ):
             return [folder]
@@ -250,14 +230,14 @@ def _captures_below(folder: Path) -> list[Path]:
         return [folder]
 
 
-def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
+def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     """Return the capture's files. Raises InputError if images or lights are missing, or filenames.txt is wrong.
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
-    listed = find_named(folder, [FILENAMES]) is not None
+    listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
-    images, _ = find_images(of_images, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    images, _ = files.find_images(of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | _RESULT_WORDS
     others = tuple(image for image in images if _is_other(image, words))
     if listed or len(others) > _MOST_OTHERS * len(images):
@@ -274,22 +254,22 @@ def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
             else "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
-    layout, ground_truth = "plain folder", GROUND_TRUTH
-    if listed and find_named(folder, ["light_directions.txt"]) is not None:
+    layout, ground_truth = "plain folder", files.GROUND_TRUTH
+    if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
-        layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    files = _gather(layout, folder, images, lights, overrides, ground_truth, others)
-    return files if listed else replace(files, warnings=(*files.warnings, *copies(images)))
+        layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
+    found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    return found if listed else replace(found, warnings=(*found.warnings, *files.copies(images)))
 
 
-def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
-    lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
-    objects = folder / IMAGE_FOLDERS[0]
+    lights = overrides.lights or files.find_named(folder, PSBOX_LIGHTS)
+    objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
-    images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    check_not_empty(images, objects)
+    images = files.list_images(objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    files.check_not_empty(images, objects)
     return _gather("PSBox", folder, images, lights, overrides)
 
 
@@ -298,27 +278,27 @@ def _gather(
     folder: Path,
     images: tuple[Path, ...],
     lights: Path | None,
-    overrides: Overrides,
-    ground_truth: Sequence[str] = GROUND_TRUTH,
+    overrides: files.Overrides,
+    ground_truth: Sequence[str] = files.GROUND_TRUTH,
     others: tuple[Path, ...] = (),
-) -> CaptureFiles:
+) -> files.CaptureFiles:
     """Return the capture's files: the images, the lights, and any optional files in the folder.
 
     Files named by the user take precedence over files in the folder.
     """
-    mask, warnings = overrides.mask or find_named(folder, MASK), tuple[CaptureWarning, ...]()
+    mask, warnings = overrides.mask or files.find_named(folder, files.MASK), tuple[CaptureWarning, ...]()
     if mask is None:
-        mask, warnings = choose_mask(folder, images)
-        others = tuple(path for path in others if not warnings or not is_mask_name(path))
-    return CaptureFiles(
+        mask, warnings = files.choose_mask(folder, images)
+        others = tuple(path for path in others if not warnings or not files.is_mask_name(path))
+    return files.CaptureFiles(
         layout,
         _own_name(folder),
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        light_intensities=overrides.intensities or files.find_named(folder, files.LIGHT_INTENSITIES),
         mask=mask,
-        ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
+        ground_truth=overrides.ground_truth or files.find_named(folder, ground_truth),
         others=others,
         warnings=warnings,
     )

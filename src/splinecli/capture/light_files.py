@@ -16,27 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import light_formats
+from splinecli.capture import light_formats, light_rows
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
-from splinecli.capture.formats.numbers import (
-    DECIMAL_POINT,
-    MOST_TEXT,
-    NumberRows,
-    columns,
-    has_decimal_commas,
-    read_number_rows,
-)
-from splinecli.capture.light_rows import (
-    COLUMNS,
-    USUAL_FRAME,
-    LightFrame,
-    RowForm,
-    check_angles,
-    counts_rows,
-    directions_from_angles,
-    read_light_rows,
-    refuse_angles,
-)
+from splinecli.capture.formats import numbers
+from splinecli.capture.formats.numbers import NumberRows
+from splinecli.capture.light_rows import USUAL_FRAME, LightFrame, RowForm
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 from splinecli.maths.normals import unit
@@ -46,8 +30,8 @@ _FILE = "a text file with a line {} for each image"
 
 
 def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    meaning = COLUMNS[form]
-    return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+    meaning = light_rows.COLUMNS[form]
+    return light_rows.read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
 
 
 def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
@@ -142,7 +126,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
             entries.sort(key=lambda e: "light" not in e.name.lower())
             for path in entries[:_MOST_TRIED]:
                 name = path.name.lower()
-                if _NO_LIGHTS.search(name) or path.stat().st_size > MOST_TEXT:
+                if _NO_LIGHTS.search(name) or path.stat().st_size > numbers.MOST_TEXT:
                     continue
                 angles: RowForm = "slant-tilt" if _SLANT_WORD.search(name) else "azel"
                 for form in ("xyz", angles):
@@ -204,14 +188,14 @@ def lights_of(
     if table.are_vectors:
         form = "positions" if form == "positions" else "xyz"
     else:
-        table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+        table = _sort_by_count(_drop_count_line(table, n_images), min(light_rows.COLUMNS[form]), n_images)
         if form == "xyz":
-            refuse_angles(table)
+            light_rows.refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
-    vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
+    vectors, transposed = _one_light_a_row(table, light_rows.COLUMNS[form], what, n_images)
     if form in ("azel", "slant-tilt"):
-        check_angles(table, form)
-        vectors = directions_from_angles(vectors, form)
+        light_rows.check_angles(table, form)
+        vectors = light_rows.directions_from_angles(vectors, form)
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     places = [
@@ -275,7 +259,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
     with the line for an unusable intensity.
     """
-    table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
+    table = _drop_count_line(numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
     for light, channel in np.argwhere((intensities < 1 / _STRONGEST) | (intensities > _STRONGEST)):
@@ -295,7 +279,7 @@ def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> N
     rows = table.rows
     fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
     in_columns = n_images is None and len(rows) == n_columns  # one light in each
-    if not fits or in_columns or counts_rows([row.numbers[0] for row in rows]) is None:
+    if not fits or in_columns or light_rows.counts_rows([row.numbers[0] for row in rows]) is None:
         return table
     ordered = sorted(rows, key=lambda row: row.numbers[0])
     return replace(table, rows=tuple(row._replace(numbers=row.numbers[1:]) for row in ordered))
@@ -313,7 +297,7 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if count in (len(following), len(following[0].numbers)):
         return without
     if not count.is_integer():
-        expected = columns(len(following[0].numbers))
+        expected = numbers.columns(len(following[0].numbers))
         raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
     problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
     raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
@@ -332,9 +316,11 @@ def _one_light_a_row(
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.rows[0].text
-        decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
-        problem = f"found {columns(n_columns)}, expected {expected}"
-        hint = DECIMAL_POINT if decimal_commas else None
+        decimal_commas = n_columns > 3 and (
+            numbers.has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
+        )
+        problem = f"found {numbers.columns(n_columns)}, expected {expected}"
+        hint = numbers.DECIMAL_POINT if decimal_commas else None
         raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from splinecli.capture import linearise
 from splinecli.capture.files import CaptureFiles
 from splinecli.capture.formats.decoders import stderr_is_apart
 from splinecli.capture.formats.facts import ImageHeader, StoredSize
@@ -24,16 +25,7 @@ from splinecli.capture.formats.images import (
 )
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
-from splinecli.capture.linearise import (
-    AS_STORED,
-    EVERY_PIXEL,
-    WHOLE,
-    RadiometricCalibration,
-    StoredPixels,
-    Window,
-    collect_observations,
-    pixel_reader,
-)
+from splinecli.capture.linearise import AS_STORED, WHOLE, RadiometricCalibration, StoredPixels, Window
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import ESTIMATED_COLOURS, GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning, mask_inverted
@@ -136,7 +128,7 @@ class CaptureSource:
             around = surroundings(mask)
             n_around = int(np.count_nonzero(around))
         images = self.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
-        collected = collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
+        collected = linearise.collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
         observations, saturation, warnings, colours = collected
         equal = self.intensities_known and not self.intensities_measured
         if equal or as_stored or not divide_colours:
@@ -252,7 +244,7 @@ class CaptureSource:
         indices: Sequence[int],
         use: Callable[[StoredPixels], Item],
         progress: Progress = lambda: None,
-        wanted: Integers | slice = EVERY_PIXEL,
+        wanted: Integers | slice = linearise.EVERY_PIXEL,
         around: Bools | None = None,
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
@@ -261,7 +253,7 @@ class CaptureSource:
         if an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
-        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
+        pixels_of = linearise.pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
 
         def read(index: int) -> Item:
             facts, intensity = self.facts[index], self.light_intensities[index]
