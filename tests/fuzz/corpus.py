@@ -22,23 +22,14 @@ OUT = "out"
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of input.
+    """A kind of input."""
 
-    Args:
-        name: for people, and the name of its folder.
-        write: writes its files into an empty folder.
-        files: patterns of the files that are mutated.
-        commands: the arguments of each command that reads them.
-        earlier: the commands whose output is there before; the first of `commands` if there is none.
-        grows: whether a command that fails late has already added to the earlier output.
-    """
-
-    name: str
-    write: Callable[[Path], None]
-    files: tuple[str, ...]
-    commands: tuple[str, ...]
-    earlier: tuple[str, ...] = ()
-    grows: bool = False
+    name: str  # for people, and the name of its folder
+    write: Callable[[Path], None]  # writes its files into an empty folder
+    files: tuple[str, ...]  # patterns of the files that are mutated
+    commands: tuple[str, ...]  # the arguments of each command that reads them
+    earlier: tuple[str, ...] = ()  # the commands whose output is there before; the first of `commands` if there is none
+    grows: bool = False  # whether a command that fails late has already added to the earlier output
 
 
 def normals() -> np.ndarray:
@@ -50,10 +41,6 @@ def normals() -> np.ndarray:
 
 def shaded(light: np.ndarray) -> np.ndarray:
     return np.rint((normals() @ light).clip(0) * 50_000).astype(np.uint16)
-
-
-def picture_of(vectors: np.ndarray) -> np.ndarray:
-    return np.rint((vectors + 1) / 2 * 65_535).astype(np.uint16)
 
 
 def png_capture(folder: Path) -> None:
@@ -132,7 +119,7 @@ def light_files(folder: Path) -> None:
 
 
 def normal_maps(folder: Path) -> None:
-    cv2.imwrite(str(folder / "n.png"), picture_of(normals())[:, :, ::-1])
+    cv2.imwrite(str(folder / "n.png"), np.rint((normals()[..., ::-1] + 1) / 2 * 65_535).astype(np.uint16))
     tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
@@ -314,13 +301,8 @@ def write_corpus(
 ) -> list[Target]:
     """Write the files of the targets into folders of their names, each with the output of an earlier run.
 
-    Every command runs once on whole input. This also imports all that it needs.
-
-    Args:
-        folder: where to write.
-        case: where the commands will run. They run there now, because reports and checkpoints name absolute paths.
-        run: runs a command in a folder and returns its exit code.
-        names: names of targets; empty for all.
+    Every command runs once on whole input, which also imports all that it needs. It runs in the folder `case`, where
+    the commands will run, because reports and checkpoints name absolute paths. Without names, all targets are written.
     """
     targets = [target for target in TARGETS if not names or target.name in names]
     folder.mkdir()
