@@ -106,12 +106,11 @@ class Highlight:
 def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
     """Return the highlight of the lamp in the ball: the weighted centroid of its brightest patch.
 
+    Raises InputError if the ball shows no highlight, or its brightest patch is too wide for a lamp.
+
     Args:
         image: (H, W), linear gray values.
         full_scale: the value at which pixels saturate. None for images that do not saturate.
-
-    Raises:
-        InputError: the ball shows no highlight, or its brightest patch is too wide for a lamp.
     """
     inside = circle.inside(image.shape)
     values = np.where(inside, image, 0).astype(np.float32)

@@ -34,17 +34,14 @@ def measure_light_intensities(
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
     By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
-    pixels are found as in a capture.
+    pixels are found as in a capture. Raises InputError if the numbers of images and lights differ, an image cannot be
+    read or has another size, or the target is dark or saturated under a light.
 
     Args:
         files: one image of the target for each light, and a mask of the target. A card without a mask fills the image.
             An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
-
-    Raises:
-        InputError: the numbers of images and lights differ, an image cannot be read or has another size, or the target
-            is dark or saturated under a light.
     """
     n_lights = len(light_directions)
     if len(files.images) != n_lights:

@@ -7,6 +7,7 @@ for each line of the object's light.txt: 00000.tif and so on. A capture is one s
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,16 +18,9 @@ from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
 
-TREES = ("PRPS", "PRPS_Diffuse")  # folders of objects in the published tree
-
 _PREFIX = "images_"
 _LIGHTS = "light.txt"
 _BOUNDARIES = ("inboundary.png", "onboundary.png")
-_MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
-# Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
-_ENOUGH_MARKS = 2
-_USUAL_LIGHTS = [name for each in FORMATS if not each.rank for name in each.found]
-_NUMBERED = re.compile(r"\d{5}\.tif")
 
 
 def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
@@ -46,36 +40,34 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         problem = f"found {len(captures)} folders of images ({names}), expected one"
         raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
     holder = _parent(images_folder)
-    lights = overrides.lights or files.find_named(holder, [_LIGHTS])
+    lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
-        problem = f"found no {_LIGHTS}, expected the light directions of {images_folder.name}"
+        problem = f"found no light.txt, expected the light directions of {images_folder.name}"
         raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
+    images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
+    # The object is the union of both masks, so one alone would be wrong.
+    masks = {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
+    if missing := [name for name, path in masks.items() if path is None]:
+        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(problem, path=holder, hint="Pass --mask FILE")
     return files.CaptureFiles(
         "CyclesPS",
         _name(images_folder),
         holder,
-        _list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        images,
         lights,
         light_intensities=overrides.intensities,
         mask=overrides.mask,
-        boundaries=() if overrides.mask else _find_boundaries(holder),
+        boundaries=tuple(path for path in masks.values() if path is not None),
         ground_truth=overrides.ground_truth or files.find_named(holder, files.GROUND_TRUTH),
     )
-
-
-def cyclesps_name(folder: Path) -> str | None:
-    """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
-    try:
-        captures = list_cyclesps(folder) if is_folder(folder) else None
-    except InputError:  # reading the capture will raise it again
-        return None
-    return _name(captures[0]) if captures and len(captures) == 1 else None
 
 
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
     is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
-    if not (is_images_folder or _has_marks(folder)) or files.find_named(folder, _USUAL_LIGHTS) is not None:
+    usual_lights = [name for each in FORMATS if not each.rank for name in each.found]
+    if not (is_images_folder or _has_marks(folder)) or files.find_named(folder, usual_lights) is not None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
@@ -90,23 +82,15 @@ def _name(images_folder: Path) -> str:
 
 
 def _has_marks(folder: Path) -> bool:
-    marked = [entry for entry in files.list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
-    return len({entry.name.lower() for entry in marked}) >= _ENOUGH_MARKS
+    """Return whether there are two of four files: some may be missing, and no other folder is mistaken for one."""
+    marks = {"light.txt", "gt_normal.tif", *_BOUNDARIES}
+    names = {entry.name.lower() for entry in files.list_folder(folder) if not is_folder(entry)}
+    return len(marks & names) >= 2
 
 
 def _parent(folder: Path) -> Path:
     # "." and ".." are their own parents to pathlib.
     return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
-
-
-def _find_boundaries(holder: Path) -> tuple[Path, ...]:
-    """Return both masks. The object is their union, so one alone would be wrong."""
-    found = {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
-    missing = [name for name, path in found.items() if path is None]
-    if missing:
-        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
-        raise InputError(problem, path=holder, hint="Pass --mask FILE")
-    return tuple(path for path in found.values() if path is not None)
 
 
 def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
@@ -117,36 +101,28 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
     for name in wanted:
         if name not in there:
             raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
-    n_images = sum(bool(_NUMBERED.fullmatch(name)) for name in there)
+    n_images = sum(bool(re.fullmatch(r"\d{5}\.tif", name)) for name in there)
     if n_images != n_lights:
         raise InputError(f"found {n_images} images, expected {expected}", path=folder)
     return tuple(there[name] for name in wanted)
 
 
-_WORD = re.compile(r"[a-z]+")
+_PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+# Words in the names of pictures that other programs leave beside the photographs.
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
-"""Words in the names of pictures that other programs leave beside the photographs."""
-
-_RESULT_WORDS = frozenset({"demo", "result", "results"})
-"""The same, if no light file gives the number of photographs."""
-
-_MOST_OTHERS = 0.25  # share of the images; if more names have these words, they are photographs
-
-
-PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
 
 
 def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
-    return not words.isdisjoint(_WORD.findall(image.stem.lower()))
+    return not words.isdisjoint(re.findall(r"[a-z]+", image.stem.lower()))
 
 
-def find_capture_files(folder: StrPath, overrides: files.Overrides = files.NO_OVERRIDES) -> files.CaptureFiles:
+def find_capture_files(folder: StrPath, overrides: files.Overrides | None = None) -> files.CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
     Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
     does not exist; the light file is missing; or a file of the overrides does not exist.
     """
-    folder = Path(folder)
+    folder, overrides = Path(folder), overrides or files.Overrides()
     files.list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
@@ -163,7 +139,12 @@ def find_capture_files(folder: StrPath, overrides: files.Overrides = files.NO_OV
 def capture_name(folder: StrPath) -> str:
     """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
-    return folder.stem if is_film(folder) else cyclesps_name(folder) or _own_name(folder)
+    if is_film(folder):
+        return folder.stem
+    captures = None
+    with suppress(InputError):  # reading the capture will raise it again
+        captures = list_cyclesps(folder) if is_folder(folder) else None
+    return _name(captures[0]) if captures and len(captures) == 1 else _own_name(folder)
 
 
 def _own_name(folder: Path) -> str:
@@ -186,10 +167,8 @@ def find_captures(folder: StrPath) -> list[Path]:
     A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
     or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
     captures are found by names of files; reading one may still fail. A subfolder that cannot be listed is treated as a
-    capture, so that the caller reports the error on reading it.
-
-    Raises:
-        InputError: the folder is missing, is a file, or contains no capture.
+    capture, so that the caller reports the error on reading it. Raises InputError if the folder is missing, is a file,
+    or contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
@@ -210,7 +189,7 @@ def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
         objects = folder / files.IMAGE_FOLDERS[0]
-        is_psbox = is_folder(objects) and files.find_named(folder, PSBOX_LIGHTS) is not None
+        is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
             files.find_named(folder, [files.FILENAMES]) is not None
             or files.list_images(objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS)
@@ -223,7 +202,7 @@ def _captures_in(folder: Path) -> list[Path]:
 def _captures_below(folder: Path) -> list[Path]:
     """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
     try:
-        if folder.name in TREES:
+        if folder.name in ("PRPS", "PRPS_Diffuse"):
             return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
         return _captures_in(folder)
     except InputError:
@@ -238,9 +217,10 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
     images, _ = files.find_images(of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | _RESULT_WORDS
+    # Without a light file, nothing gives the number of photographs.
+    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
-    if listed or len(others) > _MOST_OTHERS * len(images):
+    if listed or len(others) > 0.25 * len(images):  # so many are photographs
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
@@ -264,7 +244,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
-    lights = overrides.lights or files.find_named(folder, PSBOX_LIGHTS)
+    lights = overrides.lights or files.find_named(folder, _PSBOX_LIGHTS)
     objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
@@ -296,7 +276,7 @@ def _gather(
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or files.find_named(folder, files.LIGHT_INTENSITIES),
+        light_intensities=overrides.intensities or files.find_named(folder, ["light_intensities.txt"]),
         mask=mask,
         ground_truth=overrides.ground_truth or files.find_named(folder, ground_truth),
         others=others,

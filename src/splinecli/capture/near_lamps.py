@@ -33,8 +33,7 @@ from splinecli.system.files import is_substitution
 class NearLamps:
     """F lamps as points of light, over an image of known scale.
 
-    Raises:
-        InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
+    Raises InputError if a position is not finite or not in front of the object, or the pixel size is not above 0.
     """
 
     positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
@@ -220,8 +219,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
 class LampOptions:
     """The user's options for near lamps and the camera. All lengths have the same unit, such as millimetres.
 
-    Raises:
-        UsageError: a number is not above 0, or two options contradict each other.
+    Raises UsageError if a number is not above 0, or two options contradict each other.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
@@ -318,7 +316,11 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         InputError: a file is wrong, or positions are the only lights and their scale is unknown.
         UsageError: an option needs positions, and there are none.
     """
-    positions, used = _find_positions(folder, lights, options)
+    positions, used = _path(options.positions), True
+    if positions is None and options.distance is None:
+        positions, used = find_named(folder, LIGHT_POSITIONS), lights is None
+        if positions is None and lights is not None and lights.is_file():
+            positions = find_named(lights.parent, LIGHT_POSITIONS)
     if positions is None and options.distance is None:
         if options.given is not None:
             problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
@@ -350,16 +352,6 @@ def find_camera(
         return None, ()
     stamp = stamp_content(path)  # before it is read
     return read_camera_matrix(path), (stamp,)
-
-
-def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
-    """Return the file of positions, and whether to use positions rather than distant lights."""
-    if options.positions is not None or options.distance is not None:
-        return _path(options.positions), True
-    in_folder = find_named(folder, LIGHT_POSITIONS)
-    if lights is None or in_folder is not None or not lights.is_file():
-        return in_folder, lights is None
-    return find_named(lights.parent, LIGHT_POSITIONS), False
 
 
 def _path(name: str | None) -> Path | None:

@@ -217,14 +217,14 @@ def _match_count(
     try:
         return images, read_lights(path, len(images), frame, form)
     except InputError as error:
-        for key in (_stated_size, _name_form):
+        for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
             keys = [key(image) for image in images]
             usual = Counter(keys).most_common(1)[0][0]
             alike = tuple(image for image, of_image in zip(images, keys, strict=True) if of_image == usual)
             if len(alike) < len(images):
                 with suppress(InputError):
                     return alike, read_lights(path, len(alike), frame, form)
-        found = _COUNTS.match(error.problem)
+        found = re.match(r"found (\d+) [a-z ]+, expected \d+, one for each image", error.problem)
         if found is None or int(found[1]) >= len(images):
             raise
         names = [image.name for image in images[int(found[1]) :]]
@@ -232,16 +232,9 @@ def _match_count(
         raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 
-_COUNTS = re.compile(r"found (\d+) [a-z ]+, expected \d+, one for each image")
-
-
 def _stated_size(image: Path) -> tuple[int, ...] | None:
     size = read_header(image).stated_size
     return None if size is None else size[0][:2]
-
-
-def _name_form(image: Path) -> str:
-    return re.sub(r"\d+", "0", image.name.lower())
 
 
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Float64Array:

@@ -51,7 +51,7 @@ def check_stored_size(
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        problem = f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
+        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
         raise InputError(problem, path=path, hint="If the size is right, use a smaller copy of the image")
     check_memory(n_bytes, takes, path)
 
@@ -72,16 +72,12 @@ def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = Non
     """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
-        problem = f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available"
+        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available"
         raise InputError(problem, path=path, hint=hint)
 
 
 def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} x {shape[0]}"
-
-
-def _gigabytes(n_bytes: float) -> str:
-    return f"{n_bytes / 1e9:.1f} GB"
 
 
 def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
@@ -272,10 +268,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
     So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the mask, because
-    colours mean nothing in such an image.
-
-    Raises:
-        InputError: the image cannot be read, or no pixel is above zero.
+    colours mean nothing in such an image. Raises InputError if the image cannot be read, or no pixel is above zero.
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path, expected)

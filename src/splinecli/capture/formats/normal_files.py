@@ -44,14 +44,13 @@ def read_normal_map(
 ) -> Float32Array:
     """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a normal.
 
+    Raises InputError if the file cannot be read, contains no normal map, or is not of the mask's size.
+
     Args:
         path: any of the files above but text.
         mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
             something out, that is left out, too.
         convention: whether green is y up or y down in a picture.
-
-    Raises:
-        InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
     """
     path = Path(path)
     expected = None
@@ -76,14 +75,12 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
     Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text files are flipped
-    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest.
+    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest. Raises InputError
+    if the file cannot be read, has another size, or has no normal inside the mask.
 
     Args:
         path: any of the files above; pictures as PNG or TIFF.
         mask: (H, W), of the size of the images, True at the pixels whose normals are read.
-
-    Raises:
-        InputError: the file cannot be read, has another size, or has no normal inside the mask.
     """
     path = Path(path)
     suffix = path.suffix.lower()

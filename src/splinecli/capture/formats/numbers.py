@@ -27,7 +27,7 @@ from splinecli.system.files import check_file, is_substitution, reading
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
 _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
-_LINE_END = re.compile(r"\r\n|\r|\n")
+
 _FROM_PIPES: dict[Path, bytes] = {}
 
 WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
@@ -83,11 +83,8 @@ def check_length(path: Path, most: int, expected: str = "a text file") -> None:
     check_file(path, expected)
     length = path.stat().st_size
     if length > most:
-        raise _too_long(f"{length / 1e6:.1f} MB", most, path)
-
-
-def _too_long(found: str, most: int, path: Path) -> InputError:
-    return InputError(f"found {found}, expected a text file of at most {most / 1e6:.1f} MB", path=path)
+        problem = f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB"
+        raise InputError(problem, path=path)
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
@@ -105,7 +102,8 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
             with path.open("rb") as pipe:
                 content = pipe.read(most + 1)
             if len(content) > most:
-                raise _too_long(f"more than {most / 1e6:.1f} MB", most, path)
+                size = f"{most / 1e6:.1f} MB"
+                raise InputError(f"found more than {size}, expected a text file of at most {size}", path=path)
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
 
@@ -129,7 +127,7 @@ def read_lines(
             hint = "Save it as plain UTF-8 text"
             raise InputError("the file is not UTF-8 text", path=path, hint=hint) from None
         text = content.decode("latin-1")
-    lines = _LINE_END.split(text)
+    lines = re.split(r"\r\n|\r|\n", text)
     if len(lines) > most // 20:  # bytes of a line, on average: each line takes time and memory
         raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path=path)
     return lines
