@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import light_formats, light_rows
+from splinecli.capture import light_formats as readers
+from splinecli.capture import light_rows
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
 from splinecli.capture.formats import numbers
 from splinecli.capture.formats.numbers import NumberRows
@@ -63,32 +64,15 @@ class LightFormat:
 
 
 FORMATS = (
-    LightFormat(
-        "text",
-        (),
-        _read_text,
-        ("light_directions.txt", "lights.txt"),
-        encode=_encode_text,
-    ),
-    LightFormat(
-        "NumPy", (".npy",), light_formats.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy
-    ),
-    LightFormat("RTI", (".lp",), light_formats.read_lp, ("*.lp",), 1, encode=_encode_lp),
-    LightFormat("Relight", (".dome", ".json"), light_formats.read_dome, ("*.dome",), 2, light_formats.is_dome),
-    LightFormat(
-        "JSON list", (".json",), light_formats.read_json_list, ("light_directions.json",), 2, light_formats.is_list
-    ),
-    LightFormat("AliceVision", (".json",), light_formats.read_alicevision, ("*lights.json",), 1),
-    LightFormat(
-        "CSV",
-        (".csv",),
-        _read_text,
-        ("light_directions.csv", "lights.csv"),
-        2,
-        encode=_encode_text,
-    ),
-    LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
-    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
+    LightFormat("text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text),
+    LightFormat("NumPy", (".npy",), readers.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy),
+    LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
+    LightFormat("Relight", (".dome", ".json"), readers.read_dome, ("*.dome",), 2, readers.is_dome),
+    LightFormat("JSON list", (".json",), readers.read_json_list, ("light_directions.json",), 2, readers.is_list),
+    LightFormat("AliceVision", (".json",), readers.read_alicevision, ("*lights.json",), 1),
+    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
+    LightFormat("MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2),
+    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), readers.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )
 """All formats of light files. This table defines how they are named, found, read and written."""
 
