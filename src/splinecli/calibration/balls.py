@@ -118,11 +118,8 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
     if brightest <= 4.0 * median or brightest <= 0:  # smallest ratio of the highlight to the median of the ball
-        raise InputError(
-            "found no highlight in the ball",
-            hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
-            " lamp must be by far the brightest spot in the ball",
-        )
+        hint = "Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the lamp"
+        raise InputError("found no highlight in the ball", hint=f"{hint} must be by far the brightest spot in the ball")
     _, labels = cv2.connectedComponents((smooth >= _HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
     # Of several patches, take the one with the most light rather than the one with the brightest pixel.
     light = np.bincount(labels.ravel(), weights=smooth.ravel())
@@ -304,10 +301,7 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     except InputError as error:
         raise InputError(error.problem, path=error.path or path, hint=error.hint) from None
     if circle.reaches_beyond(shape):
-        raise InputError(
-            f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels) is not entirely"
-            " inside the image",
-            path=path,
-            hint="Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R",
-        )
+        ball = f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
+        hint = "Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R"
+        raise InputError(f"{ball} is not entirely inside the image", path=path, hint=hint)
     return circle, source

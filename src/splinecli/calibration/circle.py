@@ -113,11 +113,8 @@ def find_circle(image: Array) -> Circle:
             if merit > highest:
                 best, highest = circle, merit
     if best is None:
-        raise InputError(
-            "found no circle, expected a ball",
-            hint="Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its"
-            " circle with --circle X,Y,R",
-        )
+        hint = "Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its circle"
+        raise InputError("found no circle, expected a ball", hint=f"{hint} with --circle X,Y,R")
     return best
 
 

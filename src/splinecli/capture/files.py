@@ -105,11 +105,9 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     if not images:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
         found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
-        raise NoImagesError(
-            "the folder contains no images" + (f", but {found}" if found else ""),
-            path=folder,
-            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images",
-        )
+        problem = "the folder contains no images" + (f", but {found}" if found else "")
+        hint = "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images"
+        raise NoImagesError(problem, path=folder, hint=hint)
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:

@@ -222,15 +222,12 @@ def unit_directions(
             hint = "Write x y z towards the light, or remove the line and its image"
             raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
-            raise InputError(
-                f"found a {'lamp behind the object' if lamps else 'light below the horizon'}{place}"
-                f" (z = {vector[2]:g}), expected z > 0",
-                path=path,
-                line=line,
-                hint="z points away from the camera in this file: add --light-frame z-away"
-                if (directions[:, 2] < 0).all()
-                else "z points to the camera; the file may be in another frame",
-            )
+            what = "lamp behind the object" if lamps else "light below the horizon"
+            hint = "z points to the camera; the file may be in another frame"
+            if (directions[:, 2] < 0).all():
+                hint = "z points away from the camera in this file: add --light-frame z-away"
+            problem = f"found a {what}{place} (z = {vector[2]:g}), expected z > 0"
+            raise InputError(problem, path=path, line=line, hint=hint)
     return directions
 
 
@@ -346,13 +343,10 @@ class NamedLights:
             return tuple(images), "order"
         present = {image.name.casefold() for image in images}
         missing = next((i for i, name in enumerate(self.names) if name.casefold() not in present), 0)
-        raise InputError(
-            f"found {len(self.names)} lights but {len(images)} images;"
-            f' the image "{self.names[missing]}" is not among them',
-            path=self.path,
-            line=self.lines[missing],
-            hint="Correct the names in the file, or give as many images as lights, in the same order",
-        )
+        problem = f"found {len(self.names)} lights but {len(images)} images; the image"
+        hint = "Correct the names in the file, or give as many images as lights, in the same order"
+        problem = f'{problem} "{self.names[missing]}" is not among them'
+        raise InputError(problem, path=self.path, line=self.lines[missing], hint=hint)
 
 
 def read_lights(

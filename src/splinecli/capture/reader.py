@@ -349,9 +349,8 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
 def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
     vectors = np.asarray(directions, np.float64)
     if vectors.shape != (n_lights, 3):
-        raise UsageError(
-            f"found light directions of shape {vectors.shape}, expected (F, 3) = {(n_lights, 3)}, one for each image"
-        )
+        expected = f"(F, 3) = {(n_lights, 3)}, one for each image"
+        raise UsageError(f"found light directions of shape {vectors.shape}, expected {expected}")
     if not np.isfinite(vectors).all():
         raise InputError("a light direction is not finite")
     rows = [f" in row {row}" for row in range(n_lights)]

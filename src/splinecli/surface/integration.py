@@ -221,10 +221,9 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        raise InputError(
-            f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
-            hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",
-        )
+        problem = f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1"
+        hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the result"
+        raise InputError(problem, hint=hint)
     assert surface.prior is not None
     farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
     away = np.abs(surface.prior - np.nanmedian(surface.prior)) > farthest
@@ -260,8 +259,6 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     wrong[mask] = ~(np.abs(length - 1) <= 1e-2)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
-        raise InputError(
-            f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors, the first in row "
-            f"{row}, column {column}",
-            hint="Leave pixels without a normal out of the mask",
-        )
+        problem = f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors, the first in"
+        hint = "Leave pixels without a normal out of the mask"
+        raise InputError(f"{problem} row {row}, column {column}", hint=hint)

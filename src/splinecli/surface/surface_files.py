@@ -36,9 +36,7 @@ SURFACE_FILES = {
 """The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
 
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
-DEFAULT_MESHES = ("glb", "ply")
-DEPTH_FORMATS = ("npy", "tiff", "png")
-DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
+DEFAULT_FORMATS = ("glb", "ply", "npy", "tiff", "png")
 GRAY = 204  # colour of a mesh without a texture, of 255
 
 

@@ -52,12 +52,9 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     usable = (sharpness >= 0.6 * np.array(around)) & bright & (clipped <= max(0.01, float(np.median(clipped))))
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
-        raise InputError(
-            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light,"
-            f" expected at least {FEWEST_FRAMES}",
-            path=film,
-            hint="Film from a tripod while the lamp moves all around the object, with focus and exposure locked",
-        )
+        problem = f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light, expected"
+        hint = "Film from a tripod while the lamp moves all around the object, with focus and exposure locked"
+        raise InputError(f"{problem} at least {FEWEST_FRAMES}", path=film, hint=hint)
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 

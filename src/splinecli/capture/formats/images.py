@@ -37,9 +37,8 @@ class ExpectedSize:
     def check(self, found: tuple[int, ...], path: Path) -> None:
         """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
-            raise InputError(
-                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
-            )
+            problem = f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}"
+            raise InputError(problem, path=path)
 
 
 def check_stored_size(

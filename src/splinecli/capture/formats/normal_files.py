@@ -169,12 +169,9 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     # Unit vectors may have gone through 8 bits, resizing or JPEG. In photographs, a third has unit length by chance.
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
-        raise InputError(
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected nearly"
-            " all: these are no normals",
-            path=path,
-            hint="If the background is not black, give a mask",
-        )
+        problem = f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected"
+        hint = "If the background is not black, give a mask"
+        raise InputError(f"{problem} nearly all: these are no normals", path=path, hint=hint)
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
