@@ -88,15 +88,14 @@ def tiff_capture(folder: Path) -> None:
     (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
 
 
-def pgm_capture(folder: Path) -> None:
+def pgm_and_stack_captures(folder: Path) -> None:
+    for name in ("pgm", "stack"):
+        (folder / name).mkdir()
+        np.savetxt(folder / name / "lights.txt", LIGHTS)
     for number, light in enumerate(LIGHTS):
-        cv2.imwrite(str(folder / f"{number}.pgm"), shaded(light))
-    np.savetxt(folder / "lights.txt", LIGHTS)
-
-
-def stack_capture(folder: Path) -> None:
-    tifffile.imwrite(folder / "stack.tif", np.stack([shaded(light) for light in LIGHTS]), photometric="minisblack")
-    np.savetxt(folder / "lights.txt", LIGHTS)
+        cv2.imwrite(str(folder / f"pgm/{number}.pgm"), shaded(light))
+    pictures = np.stack([shaded(light) for light in LIGHTS])
+    tifffile.imwrite(folder / "stack/stack.tif", pictures, photometric="minisblack")
 
 
 def light_files(folder: Path) -> None:
@@ -179,17 +178,11 @@ def meshes(folder: Path) -> None:
         shape.export(folder / f"m.{ending}", file_type=ending)
 
 
-def earlier_results(folder: Path) -> None:
-    """Captures whose results are read again: reports, thumbnails, finished trials."""
+def two_captures(folder: Path) -> None:
+    """Captures whose results are read again: reports, thumbnails, finished trials, pixel sets."""
     for name in ("capture", "second"):
         (folder / name).mkdir()
         png_capture(folder / name)
-
-
-def pixel_set(folder: Path) -> None:
-    (folder / "capture").mkdir()
-    png_capture(folder / "capture")
-    shutil.copytree(folder / "capture", folder / "second")
     write_settings(folder)
 
 
@@ -246,8 +239,9 @@ TARGETS = (
     Target("tiff", tiff_capture, ("*",), (
         "infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite",
     )),
-    Target("pgm", pgm_capture, ("*.pgm",), ("infer . --method ls -o out --overwrite",)),
-    Target("stack", stack_capture, ("*.tif",), ("infer . --method ls -o out --overwrite", "info .")),
+    Target("pgm and stack", pgm_and_stack_captures, ("*/*.pgm", "*/*.tif"), (
+        *each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack",
+    )),
     Target("lights", light_files, ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"), (
         *each("infer . --method ls --lights {} -o out --overwrite",
               "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome"),
@@ -272,12 +266,12 @@ TARGETS = (
         for ending in ("png", "tif", "jpg")
         for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
     )),
-    Target("set", pixel_set, ("out/set/*", "out/set/*/*"), (
+    Target("set", two_captures, ("out/set/*", "out/set/*/*"), (
         "prepare capture second -o out/set",
         "prepare capture -o out/set --update",
         "train out/set -o out/run -q --config a.toml",
     ), earlier=("prepare capture -o out/set",), grows=True),
-    Target("earlier", earlier_results,
+    Target("earlier", two_captures,
            ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"), (
         "infer capture --method ls -o out",
         "infer second --method ls -o out --html --surface",
