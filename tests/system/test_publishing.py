@@ -15,8 +15,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from faults.sync_order import missing_syncs, record_calls
-from kills import content, killed_at
+from kills import content, killed_at, missing_syncs, record_calls
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED
