@@ -23,14 +23,7 @@ from splinecli.methods import Estimator, MethodOptions, method_names
 from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import (
-    BASE_BYTES,
-    held_results,
-    infer_capture,
-    inputs_sha256,
-    make_method,
-    source_bytes,
-)
+from splinecli.pipeline.infer import BASE_BYTES, held_results, infer_capture, inputs_sha256, make_method, source_bytes
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
@@ -69,10 +62,8 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )
+            problem = f"{other} and {folder} have the same name, so their results would overwrite each other"
+            raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]
 
 
@@ -97,9 +88,8 @@ def _batch_item(folder: Path) -> BatchItem:
         except InputError:
             return BatchItem(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
-        raise UsageError(
-            "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
-        )
+        hint = "Write lists with commas, such as --maps albedo,confidence"
+        raise UsageError("the folder does not exist", path=folder, hint=hint)
     kind = "film" if is_film(folder) else "folder"
     return BatchItem(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
 
@@ -159,10 +149,8 @@ def _failure(member: BatchItem, error: Exception) -> Outcome:
         error = as_splinecli_error(error, member.folder)
     elif not isinstance(error, SplinecliError):
         trace = "".join(traceback.format_exception(error))
-        error = SplinecliError(
-            f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
-            hint="Please report it with the lines above",
-        )
+        problem = f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli"
+        error = SplinecliError(problem, hint="Please report it with the lines above")
     if isinstance(error, NoRoomError):
         raise error
     return failed(member.name, error, trace)
@@ -205,11 +193,8 @@ def find_earlier(
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            raise OutputError(
-                f"contains {found}, but no {REPORT}, and is the folder of the capture",
-                path=target,
-                hint="Add --overwrite, or choose another place with -o",
-            ) from None
+            problem, hint = f"contains {found}, but no {REPORT}, and is the folder of the capture", "Add --overwrite"
+            raise OutputError(problem, path=target, hint=f"{hint}, or choose another place with -o") from None
         warn(f"{target}: {error}, so it is computed again")
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
@@ -287,10 +272,7 @@ def _on_workers(
     # Accept any device, because the workers may have GPUs that the command's machine does not have.
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
-    items = (
-        Item((number, member), str(member.folder), expected_bytes(member, options))
-        for number, member in enumerate(members)
-    )
+    items = (Item((n, each), str(each.folder), expected_bytes(each, options)) for n, each in enumerate(members))
     with (
         distributor(infer, Path(options.output), cluster, observer) as workers,
         observer.progress("captures", len(members), unit="captures") as advance,
@@ -303,11 +285,9 @@ def _on_workers(
                 observer.warn(warning)
             n_failed += outcome.exit_code != 0
             n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
-            advance(
-                1,
-                f"{n_ended - n_failed} done, {n_failed} failed, {len(workers.running)} running,"
-                f" {n_pixels / (time.monotonic() - began):,.0f} pixels/s",
-            )
+            speed = n_pixels / (time.monotonic() - began)
+            done = f"{n_ended - n_failed} done, {n_failed} failed, {len(workers.running)} running"
+            advance(1, f"{done}, {speed:,.0f} pixels/s")
             yield number, outcome
 
 
@@ -340,11 +320,9 @@ def _method(options: InferOptions, method: MethodOptions, sha256: str | None) ->
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
-        raise ModelError(
-            f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
-            path=options.weights,
-            hint="Use the same file, and the same version of splinecli, everywhere",
-        )
+        problem = f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command"
+        hint = "Use the same file, and the same version of splinecli, everywhere"
+        raise ModelError(problem, path=options.weights, hint=hint)
     return estimator
 
 

@@ -55,7 +55,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     if target_files is not None:
         radiometry = RadiometricCalibration(parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC)
         radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
-        warnings = [f"{target}: {warning}" for warning in of_curve]
+        warnings += [f"{target}: {warning}" for warning in of_curve]
         intensities = measure_light_intensities(
             target_files, lights.directions, "ball" if options.gray_ball is not None else "card", radiometry=radiometry
         )

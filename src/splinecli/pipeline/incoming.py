@@ -46,20 +46,15 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            raise OutputError(
-                f"contains {others[0]}, which is no frame of this film",
-                path=folder,
-                hint="Move it, or choose another -o",
-            )
+            problem = f"contains {others[0]}, which is no frame of this film"
+            raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
         whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
-            raise OutputError(
-                "contains the frames of another film, or of an earlier version of this one",
-                path=folder,
-                hint="Add --update to take those of this film, or choose another place with -o",
-            )
+            problem = "contains the frames of another film, or of an earlier version of this one"
+            hint = "Add --update to take those of this film, or choose another place with -o"
+            raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
             advance(1)
