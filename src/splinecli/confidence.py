@@ -20,14 +20,8 @@ from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-FEWEST_LIGHTS = 5  # with fewer, the residuals of a fit are not enough to assess a capture
-
-FEWEST_PIXELS = 50
-
-_BLOCKS = 2500  # over which normals are averaged for their curl
-_DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels carry no information about the capture
+FEWEST_LIGHTS, FEWEST_PIXELS = 5, 50  # with fewer, the residuals of a fit are not enough to assess a capture
 _FITS = 4
-_MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
@@ -151,7 +145,7 @@ def capture_features(
     light = lighting_at(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
-    kept = brightness > _DARK_SHARE * bright
+    kept = brightness > 0.1 * bright  # darker pixels carry no information about the capture
     if np.count_nonzero(kept) < FEWEST_PIXELS:
         return None
     values = light.observations[kept].astype(np.float64)
@@ -177,7 +171,8 @@ def capture_features(
         scaled_terms = fit_scaled_normals(terms, weights, lights)
         terms = terms - scaled_terms @ lights.T
         power = (weights * terms**2).sum()
-        amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-_MOST, _MOST))
+        # The terms hold to first order in width over distance, or in the change of the exponent.
+        amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-1.5, 1.5))
         share = amount**2 * power / max((weights * residuals**2).sum(), 1e-12)
         turn = angle_between_deg(best, unit(scaled - sign * max(sign * amount, 0.0) * scaled_terms))
         return amount, float(share), _log_median(turn, _LEAST_DEG)
@@ -260,7 +255,7 @@ def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, floa
 
 def _of_shape(mask: Bools, places: PixelPlaces, normals: Floats) -> tuple[float, float]:
     """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
-    blocks = Blocks.over(mask, _BLOCKS)
+    blocks = Blocks.over(mask, 2500)
     if min(blocks.mask.shape) < 2:
         return np.nan, np.nan
     sums = np.zeros((3, np.count_nonzero(blocks.mask)))

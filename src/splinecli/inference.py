@@ -24,16 +24,14 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
+from splinecli.lights import lighting
 from splinecli.lights.lighting import (
     IndirectLight,
     LightingAt,
     PixelIndices,
     PixelLighting,
     PixelPlaces,
-    find_indirect_light,
-    flat_depth,
     parts_of_pixels,
-    surface_points,
 )
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator, make_estimator
@@ -43,10 +41,7 @@ from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Progress
 
-METHOD = "iw12"  # the intermediate fit: fast, and robust against shadows and highlights
-
-PIXELS_ON_THE_WAY = 40_000
-"""Larger captures are fitted at about this size in between: fine detail hardly moves the surface."""
+PIXELS_ON_THE_WAY = 40_000  # larger captures are fitted at about this size: fine detail hardly moves the surface
 
 
 def find_surface(capture: Capture) -> Capture:
@@ -54,14 +49,14 @@ def find_surface(capture: Capture) -> Capture:
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
-    estimator = make_estimator(METHOD)
+    estimator = make_estimator("iw12")  # the intermediate fit: fast, and robust against shadows and highlights
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
-    depth = np.full(blocks.mask.shape, flat_depth(lamps))
+    depth = np.full(blocks.mask.shape, lighting.flat_depth(lamps))
     # Intermediate fits. An error of the surface only matters as a share of the distance of the lamps, so few are
     # enough.
     for _ in range(2):
-        points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
+        points = lighting.surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = PixelLighting.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
         normal_map = np.zeros((*blocks.mask.shape, 3))
@@ -70,13 +65,11 @@ def find_surface(capture: Capture) -> Capture:
         if lamps.camera_matrix is None:
             depth *= blocks.step  # from blocks to pixels
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
-    points = surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
+    points = lighting.surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
     return replace(capture, lamps=replace(lamps, points=points))
 
 
 Stage = Callable[[str], AbstractContextManager[Progress]]
-
-_UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
 
 @dataclass(frozen=True)
@@ -224,7 +217,7 @@ def estimate_pixels(
     if refiner is None or errors is None:
         return PixelEstimates(normals, errors, lighting_at)
     with (stage or _no_stage)("removing indirect light") as advance:
-        indirect = find_indirect_light(mask, observations, lighting_at, normals)
+        indirect = lighting.find_indirect_light(mask, observations, lighting_at, normals)
         if indirect is not None:
             lighting_at = partial(lighting_without, indirect)
             # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
@@ -271,5 +264,5 @@ def _check_unit(normals: NDArray[np.float32], method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
-        if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():
+        if not (np.abs(length - 1) <= 1e-2).all():  # accepts float16 and bfloat16, rejects zero vectors and NaN
             raise SplinecliError(f"method {method} gave normals that are not unit vectors")

@@ -20,12 +20,11 @@ from msgspec.structs import replace
 from splinecli.errors import SplinecliError, UsageError, check_one_of
 
 ARGUMENTS = "Arguments"
+# The panels of the help, in order
 PANELS = (
     *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights", "Light intensities"),
     *("Method", "Output", "Speed", "Processes and machines"),
 )
-"""The panels of the help, in order."""
-
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
 

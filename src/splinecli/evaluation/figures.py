@@ -31,9 +31,7 @@ from splinecli.system.files import free_name
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
-MOST_CAPTURES = 4
-"""Largest number of captures with a panel each. With more, only the average is plotted, to keep the figure legible."""
+MOST_CAPTURES = 4  # with a panel each. With more, only the average is plotted, to keep the figure legible
 
 _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
@@ -160,9 +158,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-SHOWN_PERCENTILES = (10, 50, 90, 99)
-"""Percentiles of SPLINE-Net's errors at which pixels are shown by default."""
-
+SHOWN_PERCENTILES = (10, 50, 90, 99)  # of SPLINE-Net's errors, at which pixels are shown by default
 MAPS = "_observation_maps"
 
 
@@ -216,7 +212,7 @@ def capture_figures(
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
-    network = next((each for each in estimators if has_observation_maps(each.name)), None)
+    network = next((e for e in estimators if e.name in METHODS and METHODS[e.name].observation_maps), None)
     # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
@@ -224,11 +220,6 @@ def capture_figures(
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
         figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
-
-
-def has_observation_maps(method: str) -> bool:
-    """Return whether a method uses observation maps, so that figures can show them."""
-    return method in METHODS and METHODS[method].observation_maps
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -255,10 +246,9 @@ def _observation_maps(
     for row, column in pixels:
         inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
         if not inside or np.isnan(errors_deg[row, column]):
-            raise UsageError(
-                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
-                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
-            )
+            problem = f"the pixel in row {row}, column {column} of {capture.name} has no ground truth"
+            hint = "Name pixels on the object, rows from the top and columns from the left, from 0"
+            raise UsageError(problem, hint=hint)
     rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
     if not pixels:
         order = np.argsort(errors_deg[rows, columns], kind="stable")

@@ -16,11 +16,7 @@ from splinecli.maths import Float64Array
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
-DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
-"""First elements of the seeds, so that draws, light noise and the choice of pixels are independent."""
-
-_REDRAWS = 1000
-_INDEX = re.compile(r"[0-9]{1,9}")
+DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3  # of the seeds: draws, noise and choice of pixels are independent
 
 
 def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
@@ -41,8 +37,8 @@ def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials:
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        problem = f"{n_lights} lights were requested, but the capture has {available}"
-        raise UsageError(problem, hint=f"Ask for at most {available} lights")
+        hint = f"Ask for at most {available} lights"
+        raise UsageError(f"{n_lights} lights were requested, but the capture has {available}", hint=hint)
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -109,19 +105,19 @@ def read_draws(path: Path) -> DrawsFile:
 
 def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
-    for _ in range(_REDRAWS):
+    for _ in range(1000):
         # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the same in later NumPy
         # versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    problem = f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws"
+    problem = f"found no {n_lights} lights that do not lie in one plane in 1000 draws"
     raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
 
 
 def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     for word in words:
-        if _INDEX.fullmatch(word) is None:
+        if re.fullmatch("[0-9]{1,9}", word) is None:
             raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
     draw = tuple(map(int, words))
     for position, index in enumerate(draw):
@@ -136,7 +132,6 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
 
 
 EVERY_CAPTURE = "*"  # key in `skip_first` for all captures without their own key
-LARGEST_SIGMA_DEG = 30.0  # largest standard deviation of the light noise that an evaluation accepts
 
 
 @dataclass(frozen=True)
@@ -167,8 +162,8 @@ class Protocol:
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
-        if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
-            raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
+        if not 0 <= self.light_noise_deg <= 30.0:
+            raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to 30")
 
     def skipped_lights(self, capture: str) -> int:
         """Return the number of lights that are skipped at the start of a capture."""
@@ -227,7 +222,6 @@ class Result:
 
     @property
     def trials(self) -> int:
-        """Number of trials."""
         return len(self.maes_deg)
 
     @property
@@ -262,12 +256,10 @@ class Evaluation:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods, without duplicates."""
         return tuple(dict.fromkeys(result.method for result in self.results))
 
     @property
     def captures(self) -> tuple[str, ...]:
-        """Names of the scored captures, without duplicates."""
         return tuple(dict.fromkeys(result.capture for result in self.results))
 
     @property

@@ -23,8 +23,7 @@ from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ
 
-# Error maps are float32, so MAEs closer than this are considered equal.
-_SAME_DEG = 1e-6
+_SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are considered equal
 
 
 @dataclass(frozen=True)
@@ -140,16 +139,10 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 _MOST_WIDE = 6  # captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
 _LATEX = str.maketrans(
-    {
-        **{character: f"\\{character}" for character in "&%$#_{}"},
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        # In TeX's oldest font encoding, which is still the default, these codes are other characters.
-        "<": r"\textless{}",
-        ">": r"\textgreater{}",
-        "|": r"\textbar{}",
-    }
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    # In TeX's oldest font encoding, which is still the default, these codes are other characters.
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 )
 
 

@@ -45,20 +45,9 @@ class Trial:
     @property
     def record(self) -> dict[str, Any]:
         """The trial as JSON values."""
-        p = self.protocol
-        return {
-            "capture": self.capture,
-            "method": self.method,
-            "number": self.number,
-            "lights": self.lights,
-            "light_noise_deg": p.light_noise_deg,
-            "seed": p.seed,
-            "max_pixels": p.max_pixels,
-            "as_stored": p.as_stored,
-            "made_of": self.made_of,
-            "light_error_deg": p.light_error_deg,
-            "finds_lights": p.finds_lights,
-        }
+        names = ("capture", "method", "number", "lights", "light_noise_deg", "seed", "max_pixels", "as_stored")
+        values = vars(self) | vars(self.protocol)
+        return {name: values[name] for name in (*names, "made_of", "light_error_deg", "finds_lights")}
 
     @property
     def key(self) -> str:
@@ -139,7 +128,6 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
 
 
-_LARGEST_TILT_DEG = 89.0
 OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
 DAMAGED_IMAGES = {"bearPNG": 20}
@@ -243,7 +231,7 @@ def tilt_lights(
     opposite way and stays above it, so that all directions are valid for a capture.
     """
     n_lights = len(light_directions)
-    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
+    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-89.0, 89.0))
     # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
     across = generator.normal(size=(n_lights, 3))
     along = np.einsum("fi,fi->f", across, light_directions)

@@ -263,11 +263,9 @@ class Distributor:
                 # The workers of a cluster have Dask's memory limits, whereas local workers share this machine's memory.
                 used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
                 if following.memory > largest:
-                    of_all = (
-                        f"{following.memory / 1e9:.1f} GB of memory, but the largest worker has {largest / 1e9:.1f} GB"
-                    )
+                    problem = f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
                     hint = "Start fewer workers on each machine, with more memory each"
-                    yield following, LostError(f"it takes about {of_all}", path=following.name, hint=hint)
+                    yield following, LostError(f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint)
                 elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:

@@ -296,8 +296,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     precision: PrecisionName = "auto"
     output: Annotated[FileName, Option("Output", "OUT", "Write results to OUT/<capture name>/.", names=OUTPUT)] = "out"
     formats: Annotated[tuple[str, ...], Option("Output", "LIST",
-        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are float32."
-        " With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are"
+        " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
         items=NORMALS)] = ("png", "npy")
     maps: Annotated[tuple[str, ...], Option("Output", "LIST",
         f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
@@ -347,9 +347,9 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     def changes(self, earlier: InferOptions) -> list[str]:
         """Return the options that affect the results, which excludes --output and --device."""
-        kinds = {name: kind for name, kind in records.field_types(type(self)).items() if name not in ("output", "device")}
+        kinds = records.field_types(type(self))
         names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
-        options = {name: records.option_of(kinds[name]) for name in names}
+        options = {name: records.option_of(kinds[name]) for name in names if name not in ("output", "device")}
         return list(dict.fromkeys(records.long_name(name, of) if of else _SCALE[name] for name, of in options.items()))
 
     @property

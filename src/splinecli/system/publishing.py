@@ -19,15 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.system.files import (
-    UNFINISHED,
-    check_writable,
-    create_hidden,
-    made_folder,
-    refusals_as_output_errors,
-    sync,
-    sync_names,
-)
+from splinecli.system import files
+from splinecli.system.files import UNFINISHED, check_writable, create_hidden, refusals_as_output_errors, sync
 
 LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
 
@@ -73,11 +66,9 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
         except PermissionError:
             if not path.exists():
                 raise
-            raise OutputError(
-                "this lock file belongs to another user, who may be writing into the folder",
-                path=path,
-                hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
-            ) from None
+            problem = "this lock file belongs to another user, who may be writing into the folder"
+            hint = "If no splinecli process of that user runs, remove the file. Otherwise choose another -o"
+            raise OutputError(problem, path=path, hint=hint) from None
         try:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
@@ -86,11 +77,8 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
             return file
         file.close()
         if not got and not wait:
-            raise BusyError(
-                "another splinecli process is writing into this folder",
-                path=path.parent,
-                hint="Wait for it to end, or choose another -o",
-            )
+            problem, hint = "another splinecli process is writing into this folder", "Wait for it to end"
+            raise BusyError(problem, path=path.parent, hint=f"{hint}, or choose another -o")
         if not got:
             time.sleep(0.02)
 
@@ -156,9 +144,9 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
     check_writable(folder)
     with ExitStack() as stack:
         with refusals_as_output_errors(folder):
-            made = stack.enter_context(made_folder(folder))
+            made = stack.enter_context(files.made_folder(folder))
             stack.enter_context(locked(folder, wait=wait))
-            sync_names(folder, *made)
+            files.sync_names(folder, *made)
             left = []
             for path in folder.glob(f".*{UNFINISHED}"):
                 if not is_plain(path):
