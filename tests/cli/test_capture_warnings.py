@@ -55,24 +55,6 @@ def test_the_same_file_under_two_lights(run, medallion):
     assert words.removesuffix(" Remove one,") in refused(run, "--method", "ls")
 
 
-def test_two_images_under_the_same_light(run, medallion):
-    lights = np.loadtxt(medallion / "light_directions.txt")
-    lights[1] = lights[0]
-    np.savetxt(medallion / "light_directions.txt", lights)
-    shutil.copy(medallion / "01.png", medallion / "02.png")
-    run("infer", medallion, "--method", "ls")
-    assert "repeated_images" not in codes()
-
-
-def test_a_black_image_is_named_without_intensities(run, medallion):
-    (medallion / "light_intensities.txt").unlink()
-    picture = cv2.imread(str(medallion / "04.png"), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(medallion / "04.png"), 0 * picture)
-    result = run("infer", medallion, "--method", "ls")
-    assert "04.png is black. Its lamp failed." in result.err
-    assert codes() == ["image_inconsistent"]
-
-
 @pytest.mark.parametrize(
     ("signs", "negated", "code"),
     [

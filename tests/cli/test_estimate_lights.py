@@ -53,14 +53,6 @@ def test_infer(unlit, run):
     np.testing.assert_allclose(np.load("again/ball/normals.npy"), np.load("out/ball/normals.npy"), atol=2e-4)
 
 
-def test_images_of_different_sizes_have_no_lights(unlit, run):
-    first = min(path for path in unlit.glob("*.png") if path.stem != "mask")
-    cv2.imwrite(str(first), cv2.imread(str(first), cv2.IMREAD_UNCHANGED)[:40])
-    (unlit / "mask.png").unlink()
-    result = run("info", unlit, "--lights", "estimate", "--plot", "sky.png")
-    assert (result.code, "pixels, expected" in result.err, Path("sky.png").exists()) == (3, True, False)
-
-
 def test_the_message_about_a_missing_light_file_names_it(unlit, run):
     result = run("infer", unlit)
     assert result.code == 3 and "--lights estimate" in result.err and "splinecli calibrate" in result.err

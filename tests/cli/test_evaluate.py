@@ -68,13 +68,6 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lig
     assert restored < as_stored / 2
 
 
-def test_several_light_counts_and_all(dataset, run, golden):
-    arguments = ["--n-lights", 4, "--n-lights", "all", "--trials", 2, "--max-pixels", 50]
-    result = run("evaluate", dataset, "--method", "ls", *arguments)
-    assert result.code == 0
-    golden("evaluate_several.txt", result.out)
-
-
 def test_a_capture_without_ground_truth_is_skipped(dataset, run, golden):
     (dataset / "matte/normals_gt.npy").unlink()
     result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")

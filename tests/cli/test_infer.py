@@ -63,22 +63,6 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
     assert preview[6, 6] > preview[12, 12] > preview[17, 17] > preview[0, 0] == 0
 
 
-def test_a_surface_in_the_albedo_s_colours(capture, run):
-    trimesh = pytest.importorskip("trimesh")
-    assert run("infer", capture, "--method", "ls", "--surface", "--maps", "albedo").code == 0
-    out = Path("out/sphere")
-    report = read_report(out)
-    assert {"mesh.glb", "mesh.ply", "depth.npy", "depth.tiff"} <= set(report["files"])
-    assert (report["surface"]["unit"], report["surface"]["n_vertices"]) == ("pixel", 448)
-    # The normals are those of z = 2.5 sqrt(..), a sphere of radius 1 over 12 pixels, stretched.
-    mesh = trimesh.load(out / "mesh.ply", process=False)
-    assert len(mesh.vertices) == 448
-    assert mesh.visual.vertex_colors[:, :3].min() >= 254
-    depth = np.load(out / "depth.npy")
-    middle, rim = depth[11:13, 11:13].mean(), np.nanmin(depth)
-    assert middle - rim == pytest.approx(12 / (2 * 2.5), rel=0.1)  # slope r / 2.5 over r = 0 .. 12, in pixels
-
-
 def test_a_surface_in_millimetres(capture, run):
     arguments = ["--surface", "--pixel-size", 0.1]
     assert run("infer", capture, "--method", "ls", *arguments).code == 0
@@ -217,15 +201,6 @@ def test_distilled(capture, run):
     assert "contains results made with" in kept.err
     (report,) = json.loads(run("infer", capture, "--exact", "--overwrite", "--json").out)
     assert report["distillation"] is None
-
-
-def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
-    run("infer", capture, "--method", "ls")
-    Path("out/sphere/notes.txt").write_text("mine")
-    (capture / "normals_gt.npy").unlink()
-    run("infer", capture, "--method", "ls", "--overwrite")
-    names = sorted(path.name for path in Path("out/sphere").iterdir())
-    assert names == ["normals.npy", "normals.png", "notes.txt", "report.json"]
 
 
 def test_output_that_cannot_be_written(capture, run, golden):

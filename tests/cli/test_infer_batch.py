@@ -203,30 +203,6 @@ def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, st
     assert [status(Meddler()), status(Observer()), status(Observer())] == ["done", "done", "skipped"]
 
 
-def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
-    now = 0.0
-
-    def takes(seconds: float, function):
-        def call(*arguments, **options):
-            nonlocal now
-            now += seconds
-            return function(*arguments, **options)
-
-        return call
-
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: now)
-    expected = dict.fromkeys((*progress.STAGES, "total"), 0)
-    for place, (stage, module, name) in enumerate((
-        ("read", source.CaptureSource, "read"), ("check", infer, "check_capture"), ("distil", infer, "distil_for"),
-        ("estimate", infer, "estimate_normals"), ("pictures", infer, "make_map"),
-        ("surface", infer, "make_surface"), ("write", files, "encode_normals"),
-    )):  # fmt: skip
-        monkeypatch.setattr(module, name, takes(10**place, getattr(module, name)))
-        expected |= {stage: 10**place, "total": expected["total"] + 10**place}
-    options = InferOptions(method="ls", surface=True, maps=("albedo",), formats=("npy",))
-    assert list(infer_capture(capture, options)["seconds"].items()) == list(expected.items())
-
-
 def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
     names = ["sphere", *map(str, (make_capture(name) for name in ("Second", "third", "\u00e9")))]
     assert run("infer", *names, "--method", "ls", "-o", "whole").code == 0

@@ -58,15 +58,6 @@ def test_the_camera_of_exif(run, tmp_path):
     assert f"camera       {words}" in run("info", tmp_path / "photographs").out
 
 
-def test_a_part_of_the_pixels_gives_the_same_report(run, capture, monkeypatch):
-    """As of large images."""
-    whole = json.loads(run("info", capture, "--json").out)
-    monkeypatch.setattr("splinecli.diagnosis.summary._ENOUGH", 400)
-    sampled = json.loads(run("info", capture, "--json").out)
-    assert sampled["exposure"].pop("bright") == pytest.approx(whole["exposure"].pop("bright"), rel=0.02)
-    assert sampled == whole
-
-
 def test_the_plot_of_the_lights(run, capture, tmp_path):
     assert run("info", str(capture), "--plot", tmp_path / "sky.png", "-q").code == 0
     picture = cv2.imread(str(tmp_path / "sky.png"))

@@ -265,23 +265,6 @@ def test_a_picture_of_the_depth(run):
         assert f"1 = {low:.7g}, 65535 = {high:.7g}; unit: millimetre" in opened.info["depth"]
 
 
-def test_a_decimated_mesh_and_its_textures(run):
-    import trimesh
-
-    cv2.imwrite("albedo.png", np.tile(np.uint8((0, 180, 0)), (*SHAPE, 1)))
-    arguments = ["--colours", "albedo.png", "--decimate", 100, "--format", "glb,ply,obj", "--json"]
-    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
-    assert (report["normal_texture"], report["colours"]) == (True, "albedo.png")
-    assert 80 <= report["n_triangles"] <= 100
-    assert report["files"] == ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "surface.json"]
-    [mesh] = trimesh.load("out/mesh.glb").geometry.values()
-    assert len(mesh.faces) == report["n_triangles"]
-    assert mesh.visual.material.normalTexture.size == mesh.visual.material.baseColorTexture.size == SHAPE[::-1]
-    assert (trimesh.load("out/mesh.ply").visual.vertex_colors[:, :3] == (0, 180, 0)).all()
-    obj = trimesh.load("out/mesh.obj", process=False)
-    assert obj.visual.material.image.getpixel((5, 5))[:3] == (0, 180, 0)
-
-
 def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
     """A mesh without triangles, and one that takes more memory than there is, have one message before the work."""
     mask = np.zeros((24, 24), np.uint8)

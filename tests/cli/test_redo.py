@@ -57,17 +57,6 @@ def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
     return ()
 
 
-def test_what_changed_is_named_by_options_that_exist(capture, run, monkeypatch):
-    """Here all of them: no option is as in the report."""
-    assert run("infer", capture, "--method", "ls", "--maps", "relief,curvature").code == 0
-    other = run("infer", capture, "--method", "ls", "--maps", "relief:3,curvature:0.2")
-    assert (other.code, "made with another --maps. Add --update" in other.err) == (5, True)
-    monkeypatch.setattr(InferOptions, "from_dict", lambda values: SimpleNamespace(**dict.fromkeys(values, "another")))
-    named = set(re.findall(r"--[a-z-]+", run("infer", capture, "--method", "ls").err.split(")")[0]))
-    known = {name for parameter in COMMAND(app).commands["infer"].params for name in parameter.opts}
-    assert len(named) > 20 and named <= known
-
-
 CHANGES = {
     "made with another --n-lights": lambda _: ("--n-lights", "4"),
     "other input files": lambda capture: replace_in(capture / "light_directions.txt", "\n", " # anew\n"),

@@ -168,14 +168,3 @@ def test_an_image_that_contradicts_the_others_is_named(run, medallion):
     assert "07.png contradicts the other images and is 0.4" in report["warnings"][0]
     left_out = ",".join(str(place) for place in range(10) if place != 6)
     assert run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0
-
-
-def test_refinement_is_suggested_for_rough_lights(run, medallion):
-    noise = np.random.default_rng(1).normal(0, 0.07, (10, 3))
-    write_lights(medallion, lambda lights: lights + noise)
-    assert json.loads(run("info", medallion, "--json").out)["warning_codes"] == ["rough_lights"]
-    result = run("infer", medallion, "--method", "ls", "--strict")  # it is no error
-    assert result.code == 0
-    assert "degrees away on average, leave" in result.err and "Try --refine-lights." in result.err
-    refined = run("infer", medallion, "--method", "ls", "--refine-lights", "--overwrite", "--json")
-    assert [warning["code"] for warning in json.loads(refined.out)[0]["warnings"]] == ["refined_lights"]

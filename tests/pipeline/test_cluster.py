@@ -182,17 +182,6 @@ def test_the_cores_are_shared_out(monkeypatch, work):
         assert run(client, work(worker_tasks.threads), numbered(range(1))) == {0: "2"}
 
 
-def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
-    call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls"]
-    assert main([*call, "-o", "out", "-q"]) == 0
-    expected = results_in("out")
-    Path("out").rename("alone")
-    assert main([*call, "-o", "out", "--workers", "2"]) == 0
-    assert results_in("out") == expected
-    out, err = capfd.readouterr()
-    assert out.count("\n") == 4 and err.endswith("4 captures: 4 done; see out/index.html\n")
-
-
 def test_shards_side_by_side_share_a_folder(cluster, tmp_path, capfd):
     """Another batch that writes the index of the folder leaves the mark by which workers know it."""
     call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls", "-o", "out"]
@@ -212,16 +201,6 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     with pytest.raises(ModelError, match="expected 1234 as on the machine of the command"):
         list(infer_batch(folders, InferOptions(method="cnn-ps"), cluster=options))
     assert not Path("out").exists()
-
-
-def test_a_folder_that_cannot_be_written_does_not_end_the_batch(cluster, tmp_path, monkeypatch):
-    folders = [Path(name) for name in write_captures(["a", "b"])]
-    Path("out").mkdir()
-    Path("out/a").write_text("a file")
-    options = ClusterOptions(address=cluster.scheduler_address)
-    outcomes = infer_batch(folders, InferOptions(method="ls"), cluster=options)
-    found = {outcome.report["capture"]: (outcome.status, outcome.exit_code) for outcome in outcomes}
-    assert found == {"a": ("failed", 5), "b": ("done", 0)}
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,19 @@ from splinecli.training import defaults
 
 if TYPE_CHECKING:
     from splinecli.evaluation.protocol import Evaluation
-    from splinecli.pipeline import options as records
+    from splinecli.pipeline.options import (
+        CalibrateOptions,
+        EvaluateOptions,
+        ImportOptions,
+        IntegrateOptions,
+        PrepareOptions,
+        TrainOptions,
+    )
     from splinecli.training.loop import Trainer
     from splinecli.training.run_files import Metrics
 
 
-def calibrate(options: records.CalibrateOptions) -> None:
+def calibrate(options: CalibrateOptions) -> None:
     """Measure light directions from images of mirror balls.
 
     A BALL is a folder with one image for each light, in the order of the lights. The outline of the ball comes from
@@ -36,7 +43,7 @@ def calibrate(options: records.CalibrateOptions) -> None:
     print_report(report, str(options.output / DIRECTIONS), as_json=options.as_json, quiet=options.quiet)
 
 
-def integrate(options: records.IntegrateOptions) -> None:
+def integrate(options: IntegrateOptions) -> None:
     """Integrate a normal map to a depth map and a mesh.
 
     Uses bilateral normal integration. The surface may break at edges, where the normals do not fit together. Without a
@@ -52,7 +59,7 @@ def integrate(options: records.IntegrateOptions) -> None:
     print_report(report, summary_line(options, report), as_json=options.as_json, quiet=options.quiet)
 
 
-def evaluate(options: records.EvaluateOptions) -> int:
+def evaluate(options: EvaluateOptions) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 
     All methods see the same draws. Captures are read as infer reads them; --as-stored reproduces published tables.
@@ -108,7 +115,7 @@ def _print_table(evaluation: Evaluation) -> None:
     Console(highlight=False, width=max(console.width, widest)).print(table, crop=False)
 
 
-def prepare(options: records.PrepareOptions) -> int:
+def prepare(options: PrepareOptions) -> int:
     """Make a pixel set, the training data of `splinecli train SET`.
 
     A pixel set has the true normal of each pixel and its observations under all lights. Writes SET/manifest.json, a
@@ -128,7 +135,7 @@ def prepare(options: records.PrepareOptions) -> int:
     return worst_exit_code(capture["exit_code"] for capture in summary["skipped"])
 
 
-def import_weights(options: records.ImportOptions) -> None:
+def import_weights(options: ImportOptions) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 
     Other commands take the weight file with --weights. Both checkpoints must come from the same training
@@ -147,7 +154,7 @@ def import_weights(options: records.ImportOptions) -> None:
         print(printable(output))
 
 
-def train(options: records.TrainOptions) -> None:
+def train(options: TrainOptions) -> None:
     """Train LI-Net and NE-Net, or with --preset refine a refinement net.
 
     Without a SET, the pixels are generated during training; a refinement net needs a SET. Writes
