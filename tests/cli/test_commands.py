@@ -64,9 +64,8 @@ FAILING = ("infer", "info", "calibrate", "integrate", "evaluate", "prepare")
 
 @pytest.mark.parametrize("name", FAILING)
 @pytest.mark.parametrize("wrong", ["nowhere", "--magic", "--output", ""], ids=lambda text: text or "no argument")
-def test_a_failure_is_a_json_document(name, wrong, run, tmp_path, monkeypatch):
+def test_a_failure_is_a_json_document(name, wrong, run):
     """A capture that cannot be read, an unknown option, an option without a value, and no argument."""
-    monkeypatch.chdir(tmp_path)
     missing = wrong == "nowhere"
     result = run(name, "--json", *wrong.split(), *(("-o", "set") if missing and name == "prepare" else ()))
     document = json.loads(result.out)

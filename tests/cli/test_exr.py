@@ -10,8 +10,6 @@ import pytest
 import tifffile
 from PIL import Image
 
-from splinecli.surface.surface_files import encode_exr
-
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header of an EXR file and its channels, each on its own."""

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from splinecli.evaluation.trials import TrialStore
-from splinecli.system.publishing import UNDONE, NewFiles
 from system.test_publishing import LINKS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")

@@ -1,6 +1,5 @@
 """One capture and many: failures, the exit code, the JSON and the index."""
 
-import base64
 import errno
 import json
 import os
@@ -10,21 +9,15 @@ from pathlib import Path
 from unittest.mock import Mock
 from urllib.parse import unquote
 
-import cv2
-import numpy as np
 import pytest
 
 from capture.test_cyclesps import write_object
 from cli.conftest import read_report
-from splinecli.capture import source
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.estimator import LeastSquares
-from splinecli.pipeline import infer
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.results import files
-from splinecli.system import progress
 from splinecli.system.files import NoRoomError
 from splinecli.system.progress import Observer
 
@@ -83,18 +76,12 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
     assert all((Path("out") / unquote(link)).is_file() for link in links)
     assert "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC" in index
-    pages = re.findall(r'<img src="data:image/jpeg;base64,([^"]+)" alt="Normal map of ([^"]+)"', index)
-    assert [name for _, name in pages] == ["sphere", "a b"]
-    normals = cv2.imread("out/sphere/normals.png", cv2.IMREAD_UNCHANGED) / 257
-    small = cv2.imdecode(np.frombuffer(base64.b64decode(pages[0][0]), np.uint8), cv2.IMREAD_COLOR)
-    assert small.shape == normals.shape  # it is small already
-    assert np.abs(small - normals).mean() < 7  # JPEG halves the resolution of colours; exchanged channels: 40
+    pages = re.findall(r'<img src="data:image/jpeg;base64,[^"]+" alt="Normal map of ([^"]+)"', index)
+    assert pages == ["sphere", "a b"]
     assert run("infer", *captures).code == 3  # our own index is replaced
     # Later results in the same place join it, and those of a single capture, too.
-    make_capture("fourth")
-    make_capture("fifth")
-    assert run("infer", "fourth", "a b", "--method", "ls", "--overwrite").code == 0
-    assert run("infer", "fifth", "--method", "ls").code == 0
+    assert run("infer", make_capture("fourth"), "a b", "--method", "ls", "--overwrite").code == 0
+    assert run("infer", make_capture("fifth"), "--method", "ls").code == 0
     links = re.findall(r'href="([^"]+)"', Path("out/index.html").read_text("utf-8"))
     assert {f"{name}/normals.npy" for name in ("sphere", "a%20b", "fourth", "fifth")} <= set(links)
     assert len([link for link in links if link == "a%20b/normals.npy"]) == 1
@@ -121,9 +108,6 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
         (("--maps", "albedo", "confidence"), 2, "confidence: the folder does not exist. Write lists with commas"),
         (("--lights", "none.txt"), 3, "none.txt: the file does not exist."),
         (("--mask", "none.png"), 3, "none.png: the file does not exist."),
-        (("--intensities", "none.txt"), 3, "none.txt: the file does not exist."),
-        (("--ground-truth", "none.mat"), 3, "none.mat: the file does not exist."),
-        (("--ambient", "none.png"), 3, "none.png: the file does not exist."),
         (("--flat-field", "none"), 3, "none: the folder does not exist."),
         (("--maps", "albedo,depth"), 2, "--maps has 'depth'"),
         (("--transfer", "rec709"), 2, "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"),
@@ -196,11 +180,10 @@ def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, st
                 (capture / name).write_bytes((capture / name).read_bytes() + b"\n")
             return super().progress(label, total)
 
-    def status(observer: Observer) -> str:
-        (outcome,) = infer_batch([capture], InferOptions(method="ls"), observer, redo="changed")
-        return outcome.status
-
-    assert [status(Meddler()), status(Observer()), status(Observer())] == ["done", "done", "skipped"]
+    options, statuses = InferOptions(method="ls"), []
+    for observer in (Meddler(), Observer(), Observer()):
+        statuses += [outcome.status for outcome in infer_batch([capture], options, observer, redo="changed")]
+    assert statuses == ["done", "done", "skipped"]
 
 
 def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
@@ -279,11 +262,6 @@ def test_files_without_permission(make_capture, run_without_privileges):
     assert first["error"] == "closed: the folder cannot be read (Permission denied)."
     assert "image/image1.png" in second["error"]
     assert third == read_report(Path("out/good"))
-    lights = Path("lights.txt")
-    lights.touch(mode=0)
-    result = run_without_privileges("infer", good, "--method", "ls", "--lights", lights, "-o", "new", "--json")
-    (document,) = json.loads(result.out)
-    assert (result.code, document["exit_code"], "lights.txt" in document["error"]) == (3, 3, True)
 
 
 def test_what_is_no_folder_is_the_failure_of_its_capture(capture, run):

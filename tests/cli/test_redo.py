@@ -2,15 +2,12 @@
 
 import json
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from cli.conftest import COMMAND, read_report
-from splinecli.cli.main import app
+from cli.conftest import read_report
 from splinecli.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions

@@ -16,7 +16,7 @@ from splinecli.training.run_files import RunLog
 
 
 @pytest.fixture(autouse=True)
-def small_runs(tmp_path, monkeypatch):
+def small_runs(monkeypatch):
     """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, tasks
@@ -24,7 +24,6 @@ def small_runs(tmp_path, monkeypatch):
     tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
-    monkeypatch.chdir(tmp_path)
 
 
 def rows() -> list[dict[str, str]]:
@@ -77,7 +76,7 @@ def test_a_run_and_its_continuation(run, monkeypatch):
     assert [row["step"] for row in rows()] == ["3", "5", "6"]
 
 
-def test_a_run_on_pixel_sets(run, no_pictures, make_capture):
+def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     write_set("set")
     write_set("more/set")
     result = run("train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5)
@@ -88,7 +87,7 @@ def test_a_run_on_pixel_sets(run, no_pictures, make_capture):
     assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
-    (report,) = json.loads(run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out)
+    report = document("infer", make_capture("sphere"), "--weights", "run/weights.safetensors")
     assert report["angular_error_deg"]["mean"] < 10
     # First from the same folder, then from another.
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0

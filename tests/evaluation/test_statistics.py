@@ -98,7 +98,3 @@ def test_pairs_without_a_test_do_not_count_in_the_correction() -> None:
 def test_the_average_takes_the_trials_all_captures_have() -> None:
     uneven = evaluation_of(ball={"a": (1.0, 2.0, 9.0)}, cat={"a": (3.0, 5.0)})
     assert trial_averages(uneven, "a") == (2.0, 3.5)
-
-
-def test_one_method_has_nobody_to_differ_from() -> None:
-    assert compare(evaluation_of(ball={"a": (1.0, 2.0)})) == ()

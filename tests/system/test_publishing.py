@@ -73,14 +73,6 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path: Path
     assert reports.count(None) > 5
 
 
-def test_a_failure_keeps_the_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    publish(tmp_path, OLD)
-    monkeypatch.setattr("splinecli.system.publishing.sync", Mock(side_effect=FULL))
-    with pytest.raises(OutputError, match="No space left on device"):
-        publish(tmp_path)
-    assert content(tmp_path) == OLD
-
-
 def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def save_half(file: IO[bytes], *_: object, **__: object) -> None:
         file.write(b"half")
@@ -272,10 +264,3 @@ def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.Monke
         pytest.fail("it has no lock")
     monkeypatch.undo()
     assert (tmp_path / LOCK).exists()
-
-
-def test_a_lock_file_that_nobody_holds(tmp_path: Path) -> None:
-    (tmp_path / LOCK).touch()
-    with locked(tmp_path):
-        pass
-    assert not (tmp_path / LOCK).exists()
