@@ -28,14 +28,10 @@ _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 def correct_errors(
     capture: Capture, estimator: Estimator, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array
 ) -> bool:
-    """Correct the distributions of errors (P, 2) in place; return whether that was possible.
+    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether that was possible.
 
     It is impossible if the capture is too small, or if the correction was not made for the estimator's weights. A pixel
-    that is dark under every light stays as it is.
-
-    Args:
-        lighting_at: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
+    that is dark under every light stays as it is. `lighting_at` gives the light of some pixels.
     """
     import torch
 
@@ -132,11 +128,8 @@ def capture_features(
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
-    Args:
-        mask: (H, W), with P true pixels.
-        lighting_at: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
-        lights: (F, 3), unit; of near lamps, at the origin.
+    The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py. Lights are (F, 3),
+    unit; of near lamps, at the origin. `lighting_at` gives the light of some pixels.
     """
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
@@ -151,8 +144,11 @@ def capture_features(
     values = light.observations[kept].astype(np.float64)
     values /= values.max(axis=1, keepdims=True)
     own = normals[rows][kept].astype(np.float64)
-    if light.directions.ndim == 3:
-        values = _as_distant(values, light.in_frame_of_capture(light.directions)[kept], lights)
+    if light.directions.ndim == 3:  # convert the values of matte pixels to distant lights
+        directions = light.in_frame_of_capture(light.directions)[kept]
+        scaled = fit_scaled_normals(values, (values > LIT_SHARE).astype(np.float64), directions.astype(np.float64))
+        values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
+        values = np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
     lit = (values > LIT_SHARE).astype(np.float64)
     shaded = (lit * values).sum(axis=1).clip(min=LIT_SHARE)
 
@@ -204,14 +200,6 @@ def capture_features(
 
 def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
     return float(np.log(np.median(values) + least))
-
-
-def _as_distant(values: Float64Array, directions: Floats, lights: Float64Array) -> Float64Array:
-    """Return values (p, F) under directions (p, F, 3) converted for matte pixels to lights (F, 3)."""
-    lit = (values > LIT_SHARE).astype(np.float64)
-    scaled = fit_scaled_normals(values, lit, directions.astype(np.float64))
-    values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
-    return np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
 
 
 def _residuals_under(

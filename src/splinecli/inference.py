@@ -5,10 +5,8 @@ normals, integrate them, move the pixels onto the surface, and fit again with th
 inverse-square falloff that the lamps have there. The surface begins as the object's mean plane. (Logothetis et al., "A
 CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
 
-If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
-
-The pixels are processed in tiles, so the working memory of a method depends on the tile size; only the results grow
-with the capture.
+If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined. Pixels
+are processed in tiles, so that only the results grow with the capture.
 """
 
 import time

@@ -1,8 +1,7 @@
 """Detect light directions in a wrong frame or order, from the images and the normals that they give.
 
-The thresholds were chosen on captures that splinecli's own renderer made (MERL's measured materials, CyclesPS's
-classes of materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the
-figures.
+The thresholds were chosen on captures of splinecli's own renderer (MERL's measured materials, CyclesPS's classes of
+materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the figures.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -53,25 +52,17 @@ class LightCheck:
     """The result of comparing the light directions with the images."""
 
     candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
-    # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
-    order: str | None
-    # distances between the images and the lights in the given order and in the better one, as shares of the median of
-    # random orders; NaN with too few lights
-    given_misfit: float
-    order_misfit: float
-    # the reading that gives better normals; None if there is none. Its frame is relative to the given one
-    best: Candidate | None
+    order: str | None  # a reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
+    given_misfit: float  # residual in the given order, as a share of random orders'; NaN with too few lights
+    order_misfit: float  # the same in the better order
+    best: Candidate | None  # the reading that gives better normals, if any. Its frame is relative to the given one
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
-    # (F, 3), the lights of the observations in the best reading; None if the given one is the best, or no reading
-    # clearly is
-    mended: Float64Array | None
-    # the median angle by which the given lights change the normals, if the best reading is right; None if the given is
-    error_deg: float | None = None
+    mended: Float64Array | None  # (F, 3), in the best reading; None for the given one, or if none clearly is best
+    error_deg: float | None = None  # median angle by which the given lights change the normals, if `best` is right
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
     lacks_shadows: bool = False  # whether they contradict the given lights, without supporting others
-    # an image that contradicts the others, without which all this was found; None if there is none
-    odd_image: OddImage | None = None
+    odd_image: OddImage | None = None  # an image that contradicts the others, without which all this was found
 
     @property
     def given(self) -> Candidate:
@@ -105,13 +96,9 @@ def check_lights(
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
 ) -> LightCheck:
-    """Compare observations (P, F) of a mask (H, W) with their lights.
+    """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of light_directions (N, 3).
 
-    Args:
-        light_directions: (N, 3), all lights of the capture, in the order of the file.
-        indices: the F lights of the observations; None for all.
-        names: of the F images, for the words of the result.
-        factors: of the observations, if they were found before.
+    `names` are those of the F images, for the words of the result, and `factors` those of the observations.
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
@@ -273,9 +260,7 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
 _WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
 
 
-def light_warnings(
-    check: LightCheck, light_file: Path, frame: LightFrame, *, strict: bool = False
-) -> list[CaptureWarning]:
+def light_warnings(check: LightCheck, light_file: Path, frame: LightFrame, strict: bool) -> list[CaptureWarning]:
     """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
 
     If `strict`, also warn of properties that the images leave undetermined, which is the case for most reliefs without

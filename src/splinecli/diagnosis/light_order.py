@@ -1,13 +1,12 @@
 """Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are shifted.
 
-A wrong order or frame of all lights is found here and by light_check.py. In a dome, single rings may also be shifted or
-mirrored against the others in the light file, because they begin at another lamp or run the other way round.
+In a dome, single rings may be shifted or mirrored against the others in the light file, because they begin at another
+lamp or run the other way round.
 
 Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
 others, as a brighter lamp would. For metals, this distinguishes right lights from wrong ones far better than known
-intensities do. On flat objects, however, free intensities explain any order.
-
-The thresholds were chosen on the same captures as in light_check.py.
+intensities do. On flat objects, however, free intensities explain any order. Thresholds are chosen as in
+light_check.py.
 """
 
 from collections.abc import Iterator, Sequence
@@ -209,12 +208,9 @@ def check_order(
     chosen: Integers,
     names: Sequence[str],
 ) -> LightOrder:
-    """Return the order of the chosen lights that fits observations (P, F) best.
+    """Return the order of the `chosen` lights (F,) of light_directions (N, 3) that fits observations (P, F) best.
 
-    Args:
-        factors: of the observations; None if too few are lit.
-        light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
-        chosen: (F,) the lights of the observations.
+    `factors` are those of the observations; None if too few are lit. All lights are shifted and reversed together.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))

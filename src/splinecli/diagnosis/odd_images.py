@@ -2,10 +2,8 @@
 
 One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow fell on it. Each
 image is left out in turn. If the residual nearly vanishes without one image, and remains without any other, this one is
-odd. So is an image that the factors of rank 3 explain far less well than all others.
-
-The thresholds were chosen on the same captures as in light_check.py, after one image was dimmed, exchanged or half in
-shadow, or one light was moved by 40 degrees.
+odd. So is an image that the factors of rank 3 explain far less well than all others. Thresholds are chosen as in
+light_check.py, after one image was dimmed, exchanged or half in shadow, or one light was moved by 40 degrees.
 
 Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see light_fit). So each image
 can be predicted from the others under any light, and its fine detail is where the prediction has it. If it is

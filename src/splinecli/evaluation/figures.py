@@ -1,8 +1,6 @@
 """Figures of evaluations: the error against a setting, and maps and observation maps of single captures.
 
-The error is plotted against the setting that differs between the evaluations: the number of lights or the light noise.
-All functions take several evaluations of the same methods. They plot only the captures that all evaluations scored, so
-that every point of an average covers the same captures.
+Curves show only the captures that all evaluations scored, so that every point of an average covers the same captures.
 """
 
 from __future__ import annotations
@@ -181,15 +179,10 @@ def capture_figures(
 ) -> list[CaptureFigure]:
     """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one of single pixels.
 
-    The figure of single pixels is omitted under near lamps or with a camera matrix. All pixels in the mask are
-    estimated, even if the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or
-    UsageError if a pixel has no ground truth.
-
-    Args:
-        name: name of the capture in the tables.
-        stem: stem of the figures' file names.
-        pixels: (row, column) of the pixels whose observation maps are shown; if empty, pixels at SHOWN_PERCENTILES.
-        advance: called with the fraction of the work just completed.
+    The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near lamps or with a
+    camera matrix. All pixels in the mask are estimated, even if the protocol has max_pixels. `name` is the capture's in
+    the tables, and `stem` that of the files. `advance` is called with the fraction of the work just completed. Raises
+    InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)

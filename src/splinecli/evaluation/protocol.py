@@ -24,15 +24,9 @@ def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials:
 
     Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the same number of lights
     get the same draws, and additional trials extend the same list. A draw is repeated only if its lights are coplanar,
-    because no method can solve it. All lights together form one draw, regardless of the number of trials.
+    because no method can solve it. All lights together, or `n_lights` of None, form one draw.
 
-    Args:
-        light_directions: (F, 3) unit.
-        n_lights: the number of lights in a draw; None for all lights.
-
-    Raises:
-        UsageError: fewer than three lights, more than available, no trials, or a negative seed.
-        InputError: in every draw, the lights were coplanar.
+    Raises UsageError for settings that are out of range, or InputError if the lights of every draw were coplanar.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)

@@ -219,9 +219,8 @@ def evaluate_all(
 ) -> list[Evaluation]:
     """Score every estimator on every capture under every protocol. None may be empty, and names must be unique.
 
-    Captures are named by capture_name or, if two names are equal, by the last parts of their paths. Duplicate folders
-    are ignored. A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome
-    contains the reason.
+    A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome contains the
+    reason. See distinct_names for the names of captures.
 
     Args:
         store: where finished trials are stored; trials in the store are not computed again.
@@ -231,8 +230,7 @@ def evaluate_all(
 
     Raises:
         UsageError: skip_first names a capture that does not exist.
-        InputError: the draws file is invalid, or no capture could be scored. With a single capture, its own error is
-            raised, which may also be a UsageError.
+        InputError: the draws file is invalid, or no capture could be scored; a single capture's own error is raised.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """

@@ -139,9 +139,7 @@ class TrialSource:
     """A capture that was read once, from which each trial takes its lights.
 
     Every draw is restored separately: a saturated observation is restored from the other lights of the draw, as
-    `infer` does when it reads only these lights.
-
-    `rows` are the rows of the observations to score; None for all rows.
+    `infer` does when it reads only these lights. `rows` are the rows of the observations to score; None for all rows.
     """
 
     stored: StoredCapture

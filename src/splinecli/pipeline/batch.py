@@ -173,14 +173,11 @@ class ChangedError(OutputError):
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results match the capture in `folder` and the options.
+    """Return the report in `target` if its results match the capture in `folder` and the options; None without results.
 
-    Returns None if no results exist. If an interrupted run left partial results, `warn` receives a sentence about this.
-
-    Raises:
-        ChangedError: the results belong to another capture or other options.
-        InputError: the capture cannot be read.
-        OutputError: `target` is also the capture's folder, where the user's own files may have the names of results.
+    If an interrupted run left partial results, `warn` receives a sentence about this. Raises ChangedError for results
+    of another capture or other options, InputError, or OutputError if `target` is also the capture's folder, where the
+    user's own files may have the names of results.
     """
     try:
         report = read_report(target)
@@ -225,14 +222,11 @@ def infer_batch(
     Args:
         folders: the captures. Duplicates are ignored.
         redo: which captures with existing results are computed again.
-        cluster: the processes or machines to run on. With 0 workers, as many are started as the machine's cores and
-            memory allow.
+        cluster: the processes or machines to run on. 0 workers are as many as the machine's cores and memory allow.
 
     Raises:
-        UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
-            exist is the name of a map, format or method.
-        InputError: a file that the options name does not exist.
-        ModelError: the weights cannot be used.
+        UsageError: see list_captures, or the options do not fit the method.
+        InputError, ModelError: a file that the options name does not exist, or the weights cannot be used.
         OutputError: the output folder cannot be written, or the disk is full. If only the folder of one capture cannot
             be written, that capture fails and the batch continues.
         SplinecliError: the connection to a Dask scheduler was lost.

@@ -39,13 +39,8 @@ class EvaluateOutcome(NamedTuple):
 def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> EvaluateOutcome:
     """Score the methods on the captures, and write the results to the output folder.
 
-    All options are checked before the first image is read.
-
-    Raises:
-        UsageError: an option does not fit the captures or the methods.
-        InputError: no capture could be scored, or a folder or the draws file is wrong.
-        ModelError: weights cannot be used.
-        OutputError: the output folder cannot be written.
+    All options are checked before the first image is read. Raises UsageError, ModelError, OutputError, or InputError if
+    no capture could be scored, or a folder or the draws file is wrong.
     """
     captures = [capture for dataset in options.datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
@@ -121,9 +116,7 @@ def _score_on_workers(
 ) -> Iterator[tuple[DrawTask, Scored]]:
     """Yield the draws with their scores as they finish, one item per draw. Only this process writes to the store.
 
-    Raises:
-        LostError: the workers of a draw were lost. All other draws are still scored.
-        SplinecliError: an error from a trial or from Distributor.run.
+    Raises LostError if the workers of a draw were lost, after all others were scored; or see Distributor.run.
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)

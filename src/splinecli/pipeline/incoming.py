@@ -25,13 +25,9 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo) -> Path:
     """Return the capture; for a film, the folder in `output` with its frames, which are extracted if needed.
 
-    Args:
-        redo: whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
-
-    Raises:
-        UsageError: the options do not ask for the lights of a film to be estimated from its images.
-        InputError: the film cannot be read, or its light does not move.
-        OutputError: the folder contains frames from another film, or other files, or the frames cannot be written.
+    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
+    Raises UsageError without --lights estimate, InputError if the film cannot be read, or its light does not move, or
+    OutputError if the folder contains frames from another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture

@@ -51,14 +51,9 @@ def describe_capture(
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the corrected lights, and return the report.
 
-    Args:
-        reading: how `infer` would read the capture. With `reading.strict`, skipped checks are also warnings.
-        plot, overwrite, check_lights, auto_mask, mended_lights: as in the help of `info`.
-
-    Raises:
-        InputError: the folder does not contain a capture, or a file cannot be read.
-        OutputError: a file exists and `overwrite` is not set, or it cannot be written.
-        UsageError: the plot would be in the folder of the images, or options contradict each other.
+    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also warnings. The other
+    arguments are as in the help of `info`. Raises InputError, OutputError, or UsageError if the plot would be in the
+    folder of the images, or options contradict each other.
     """
     reading = reading or Reading()
     for name, given in (("--check-lights", check_lights), ("--mended-lights", mended_lights is not None)):

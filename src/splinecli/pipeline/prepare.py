@@ -26,12 +26,8 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
     A capture that cannot be used is left out, and the observer receives the error; `skipped` in the summary holds the
-    reason and an exit code. Any other error stops the work; calling the function again resumes where it stopped.
-
-    Raises:
-        InputError: a mesh cannot be used.
-        OutputError: the set cannot be written, or contains a scene that was rendered with other settings.
-        UsageError: there is nothing to prepare, or the packages of the extra `render` are not installed.
+    reason and an exit code. Any other error stops the work, and calling the function again resumes it: InputError for a
+    mesh, OutputError, also for a scene with other settings in the set, or UsageError if there is nothing to prepare.
     """
     output, config = options.output, SceneConfig()
     config = replace(config, size=options.size or config.size, lights=options.n_lights or config.lights)

@@ -216,10 +216,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
     that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
-    Args:
-        report: the name of the file that describes the others: removed first, written last. None if the caller ensures
-            that no report names a file that changes.
-        stale: names of earlier files that are removed if no new file replaces them.
+    `report` names the file that describes the others: removed first, written last. It is None if the caller ensures
+    that no report names a file that changes. `stale` names earlier files that are removed if no new file replaces them.
     """
     new = NewFiles(folder)
     try:
