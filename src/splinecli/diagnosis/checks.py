@@ -267,7 +267,6 @@ def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list
         sample,
         closeup,
         intensities is not None,
-        intensities is not None,
         intensities=None if intensities is None else gray_intensities(intensities),
         estimated=capture.estimated_intensities,
         lamps=None if lamps is None else lamps.within(0, 0, sample.step, lamps.camera_matrix),

@@ -45,14 +45,15 @@ class ProtocolTrials:
         self, captures: Sequence[str], store: TrialStore, settings: Mapping[str, Mapping[str, Any]]
     ) -> Evaluation:
         """Return the outcome, in the order of the captures. Raises an error if all captures failed."""
-        results, n_estimated = [], {}
+        results, n_estimated, light_errors_deg = [], {}, {}
         for (capture, method), trials in self.trials.items():
             scores = [score for trial in trials if (score := store.find(trial)) is not None]
             seconds = math.fsum(score.seconds for score in scores) / len(scores)
             maes_deg = tuple(score.mae_deg for score in scores)
             found = [s.found_light_error_deg for s in scores if s.found_light_error_deg is not None]
-            light_error_deg = math.fsum(found) / len(found) if found else None
-            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_error_deg))
+            light_errors_deg[capture] = math.fsum(found) / len(found) if found else None
+            result = Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_errors_deg[capture])
+            results.append(result)
             n_estimated[capture] = (sum(score.estimated_intensities for score in scores), len(scores))
         if not results:
             failures = [self.failures[name] for name in captures]
@@ -70,7 +71,7 @@ class ProtocolTrials:
         ]
         notes += [
             f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on average."
-            for name, error_deg in {r.capture: r.found_light_error_deg for r in results}.items()
+            for name, error_deg in light_errors_deg.items()
             if error_deg is not None
         ]
         return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes), settings)
@@ -145,11 +146,7 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
 
 
 def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
-    """Return the draws of a capture, one for each trial.
-
-    Raises InputError if the capture has no ground truth, or a draw in the file does not fit it, or UsageError if it has
-    too few lights, or if the protocol would refine near lamps.
-    """
+    """Return the draws of a capture, one for each trial. Raises InputError or UsageError if it does not fit."""
     if source.files.ground_truth is None:  # known before the images are read
         hint = "Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat"
         raise InputError("the capture has no ground truth", path=source.files.folder, hint=hint)
@@ -177,8 +174,7 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     """Return the folders, without duplicates, with the names of the captures.
 
-    If two names are equal, all captures are named by the last parts of their paths. The name of the average in the
-    tables is never used for a capture.
+    If two names are equal, or one is that of the average in the tables, all are the last parts of their paths.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]

@@ -30,9 +30,8 @@ _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are conside
 class Comparison:
     """The difference of two methods on one capture, or on the average over the captures, trial by trial.
 
-    With one trial, or if the differences of all trials are equal but not zero (the same trial repeated), no test is
-    possible, and interval_deg, p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p
-    is 1. Differences within 1e-6 degrees, the precision of the error maps, are considered equal.
+    With one trial, or if the differences of all trials are equal but not zero, no test is possible, and interval_deg,
+    p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p is 1.
     """
 
     capture: str  # name of the capture, or AVERAGE
@@ -42,8 +41,7 @@ class Comparison:
     # mean over the trials of MAE(`first`) - MAE(`second`); `first` is better below 0
     difference_deg: float
     std_deg: float  # population standard deviation of the differences
-    # 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0 while p_holm is
-    # above SIGNIFICANCE.
+    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
     interval_deg: tuple[float, float] | None
     p_value: float | None
     p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture

@@ -99,10 +99,8 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture."""
+    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and were kept."""
 
-    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (the folder does
-    # not exist) or failed
     status: Status
     report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
     exit_code: int = 0
@@ -165,10 +163,6 @@ def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status 
 class ChangedError(OutputError):
     """A folder has results of other input files, other options or another version."""
 
-    def __init__(self, made: str, folder: Path) -> None:
-        hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
-        super().__init__(f"contains results made {made}", path=folder, hint=hint)
-
 
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
@@ -195,15 +189,18 @@ def find_earlier(
         warn(f"{target}: {error}, so it is computed again")
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
-        raise ChangedError("by another version", target) from None
-    if version != __version__:
-        raise ChangedError(f"by version {version}", target)
-    if names := options.changes(earlier):
-        differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
-        raise ChangedError(f"with {differences}", target)
-    if stamp != inputs_sha256(options.open(folder), options.weights):
-        raise ChangedError("from other input files", target)
-    return report
+        made = "by another version"
+    else:
+        if version != __version__:
+            made = f"by version {version}"
+        elif names := options.changes(earlier):
+            made = f"with another {names[0]}" if len(names) == 1 else f"with other options ({', '.join(names)})"
+        elif stamp != inputs_sha256(options.open(folder), options.weights):
+            made = "from other input files"
+        else:
+            return report
+    hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
+    raise ChangedError(f"contains results made {made}", path=target, hint=hint)
 
 
 def infer_batch(
@@ -241,13 +238,12 @@ def infer_batch(
     entries: dict[int, Entry] = {}
     if cluster.address is None and not cluster.workers:
         cluster = cluster.replace(workers=choose_workers(members, options))
-    elsewhere = cluster.on_cores(len(members))
     outcomes: Iterable[tuple[int, Outcome]]
-    if elsewhere is None:
+    if elsewhere := cluster.on_cores(len(members)):
+        outcomes = _on_workers(members, options, observer, redo, elsewhere)
+    else:
         method = cache(partial(make_method, options))
         outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
-    else:
-        outcomes = _on_workers(members, options, observer, redo, elsewhere)
     for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)

@@ -33,24 +33,11 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-_CONNECT_SECONDS = 5.0
-_ANSWER_SECONDS = 6.0  # time limit for a server to answer as a scheduler
-_CLOSE_SECONDS = 5.0
-_LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
-
-# A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
-_IGNORE_INTERRUPTS = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
-
-_QUIET = {
-    "distributed.admin.low-level-log-length": 100,
-    "distributed.admin.system-monitor.log-length": 10,
-    "distributed.admin.system-monitor.interval": "10s",
-    "distributed.admin.tick.interval": "1s",
-    "distributed.scheduler.active-memory-manager.start": False,
-    "distributed.scheduler.work-stealing": False,
-    "distributed.worker.profile.enabled": False,
-}
-"""Dask settings that disable the collection of dashboard data, which costs processor time and an hour of memory."""
+_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = 5.0, 6.0, 5.0  # a server has to answer as a scheduler
+_LOOK_SECONDS = 0.5  # between two updates of the list of workers
+_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
+SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
+SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 
 @contextmanager
@@ -105,13 +92,22 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
+    loggers = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
-        **_QUIET,
+        # No data for a dashboard, which cost processor time and an hour of memory
+        "distributed.admin.low-level-log-length": 100,
+        "distributed.admin.system-monitor.log-length": 10,
+        "distributed.admin.system-monitor.interval": "10s",
+        "distributed.admin.tick.interval": "1s",
+        "distributed.scheduler.active-memory-manager.start": False,
+        "distributed.scheduler.work-stealing": False,
+        "distributed.worker.profile.enabled": False,
         # If a worker is lost, its item is retried twice. A running cluster has its own setting.
         "distributed.scheduler.allowed-failures": 2,
-        "distributed.worker.preload": [_IGNORE_INTERRUPTS],
-        "logging": dict.fromkeys(_LOGGERS, "critical"),
+        # A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
+        "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"],
+        "logging": dict.fromkeys(loggers, "critical"),
         # On a busy machine, a restarted worker may need more time than Dask allows by default.
         "distributed.deploy.lost-worker-timeout": "1 h",
     }
@@ -154,14 +150,6 @@ def _address(text: str) -> str:
         raise UsageError(problem, hint="'dask scheduler --scheduler-file FILE' writes such a file") from None
 
 
-SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
-SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
-
-_LOOK_SECONDS = 0.5  # between two updates of the list of workers
-
-_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
-
-
 class LostError(SplinecliError):
     """A worker was lost, or has too little memory, so this item failed; other items may still succeed."""
 
@@ -183,11 +171,9 @@ def _versions() -> dict[str, str]:
 class Work:
     """The settings shared by all items of a command; they are sent with each item."""
 
-    # called with the arguments of an item; returns the result, or raises an error about the worker
-    do: Callable[..., Any]
+    do: Callable[..., Any]  # from the arguments of an item to the result; or raises an error about the worker
     probe: str  # a file in the output folder; a worker that cannot find it uses different storage
-    # the working folder of the command, against which relative paths are resolved
-    folder: str = field(default_factory=os.getcwd)
+    folder: str = field(default_factory=os.getcwd)  # of the command, against which relative paths are resolved
     versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:

@@ -52,8 +52,6 @@ def import_extra(
 
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
-_LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
-_NO_MEMORY = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
 _GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
 _MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it
@@ -98,7 +96,7 @@ def check_address_space() -> None:
 
     Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
     """
-    needed = _LIBRARIES + _BUFFER * (os.cpu_count() or 1)
+    needed = 1.5e9 + 64 * 2**20 * (os.cpu_count() or 1)
     if (most := _address_space_limit()) < needed:
         limit = f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v)"
         raise SplinecliError(f"{limit}, but at least {needed / 1e9:.1f} GB are needed", hint="Raise the limit")
@@ -172,10 +170,9 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a library."""
-    text = str(error).lower()
-    return isinstance(error, MemoryError) or (
-        isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
-    )
+    text, of_library = str(error).lower(), isinstance(error, OSError | RuntimeError | ImportError)
+    known = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
+    return isinstance(error, MemoryError) or (of_library and any(words in text for words in known))
 
 
 Device = Literal["auto", "cpu", "cuda"]

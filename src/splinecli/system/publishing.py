@@ -73,8 +73,10 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
             return file
-        if got and _is_current(file, path):
-            return file
+        # The last owner of a lock file removes it, and others recreate it.
+        with suppress(FileNotFoundError):
+            if got and os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                return file
         file.close()
         if not got and not wait:
             problem, hint = "another splinecli process is writing into this folder", "Wait for it to end"
@@ -118,14 +120,6 @@ def _try_lock(file: IO[str]) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-def _is_current(file: IO[str], path: Path) -> bool:
-    """Return whether an open file is still the one at the path: its last owner removes it, and others recreate it."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
 
 
 Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
