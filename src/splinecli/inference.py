@@ -103,26 +103,18 @@ def estimate_normals(
     capture: Capture,
     estimator: Estimator,
     *,
-    tile_pixels: int | None = None,
     progress: Progress | None = None,
     stage: Stage | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
-    The capture of the result has the points of this surface.
-
-    Args:
-        tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
-        progress: called with the number of pixels just finished, after each batch of the estimator.
-        stage: called with the name of each later stage when it begins; its function is called with the number of
-            pixels just finished.
-
-    Raises:
-        SplinecliError: the estimator gave normals that are not unit vectors.
+    The capture of the result has the points of this surface. `progress` is called with the number of pixels just
+    finished, after each batch of the estimator, and `stage` with the name of each later stage when it begins; its
+    function is called like `progress`. Raises SplinecliError if the normals are not unit vectors.
     """
     started = time.perf_counter()
     capture = find_surface(capture)
-    normals, errors, judged = _estimate(capture, estimator, tile_pixels, progress, stage)
+    normals, errors, judged = _estimate(capture, estimator, progress, stage)
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
@@ -141,15 +133,13 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
+    capture: Capture, estimator: Estimator, progress: Progress | None, stage: Stage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
     Methods without confidence have no distributions.
     """
-    found = estimate_pixels(
-        capture.mask, capture.observations, lighting_on(capture), estimator, tile_pixels, progress, stage
-    )
+    found = estimate_pixels(capture.mask, capture.observations, lighting_on(capture), estimator, progress, stage)
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner
     if refiner is not None and errors is not None:
@@ -182,7 +172,6 @@ def estimate_pixels(
     observations: NDArray[np.float32],
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
-    tile_pixels: int | None = None,
     progress: Progress | None = None,
     stage: Stage | None = None,
 ) -> PixelEstimates:
@@ -194,9 +183,8 @@ def estimate_pixels(
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
         lighting_without: gives the light of some pixels without the given indirect light; None removes nothing.
-        tile_pixels, progress, stage: see estimate_normals.
+        progress, stage: see estimate_normals.
     """
-    tile_pixels = tile_pixels or estimator.tile_pixels
     n_pixels = len(observations)
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
@@ -208,7 +196,7 @@ def estimate_pixels(
         normals[pixels] = light.in_frame_of_capture(found)
 
     lighting_at = partial(lighting_without, None)
-    refiner = estimator.refiner
+    refiner, tile_pixels = estimator.refiner, estimator.tile_pixels
     estimator = estimator.bind(lighting_at, n_pixels)
     for pixels in parts_of_pixels(n_pixels, tile_pixels):
         estimate(pixels, lighting_at(pixels), progress)

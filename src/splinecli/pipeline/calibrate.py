@@ -23,11 +23,7 @@ OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, P
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Calibrate the lights, write OUTPUT_FILES and return the report.
-
-    Raises InputError if an image or file cannot be used, or the numbers of images and lights differ, or OutputError if
-    the results exist and `overwrite` is not set, or they cannot be written.
-    """
+    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError, OutputError."""
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
         return _calibrate_into(options, observer)

@@ -119,11 +119,7 @@ def view_of_report(
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Integrate a normal map, write the surface and its report, and return the report.
-
-    Raises InputError if a file cannot be read, or the files do not fit together; OutputError if the results exist and
-    `overwrite` is not set, or cannot be written; UsageError if the discontinuity or the largest step is negative.
-    """
+    """Integrate a normal map, write the surface and its report, and return the report. Raises SplinecliError."""
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
     surface_files.check_exr(options.formats)
