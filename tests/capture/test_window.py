@@ -14,7 +14,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.inference import lighting_on
 from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
 from splinecli.surface.pixel_grid import pixel_rays
 
@@ -74,11 +74,11 @@ def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str |
 
 def test_info_counts_what_is_read() -> None:
     crop, scale = WINDOWS[2]
-    part = describe_capture(MEDALLION, InferOptions(crop=crop, scale=scale))
+    part = describe_capture(InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale))
     expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
     assert part["n_pixels"] == expected
     assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
-    assert describe_capture(MEDALLION)["reads"] is None
+    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
 @pytest.mark.parametrize(

@@ -166,16 +166,7 @@ def info(reading: Reading, options: InfoOptions) -> int:
     from splinecli.pipeline.info import describe_capture, summary_lines
 
     messages = Messages(quiet=options.quiet)
-    report = describe_capture(
-        options.capture,
-        reading,
-        messages,
-        plot=options.plot,
-        overwrite=options.overwrite,
-        check_lights=options.check_lights,
-        auto_mask=options.auto_mask,
-        mended_lights=options.mended_lights,
-    )
+    report = describe_capture(options, reading, messages)
     print_report(report, *summary_lines(report), as_json=options.as_json, quiet=options.quiet)
     wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
     if reading.strict and wrong:

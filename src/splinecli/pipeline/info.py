@@ -21,7 +21,7 @@ from splinecli.methods.estimator import student_sizes
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import Reading
+from splinecli.pipeline.infer_options import InfoOptions, Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
@@ -39,42 +39,33 @@ ORIGINS = {
 
 
 def describe_capture(
-    capture: Path,
-    reading: Reading | None = None,
-    observer: Observer = SILENT,
-    *,
-    plot: Path | None = None,
-    overwrite: bool = False,
-    check_lights: bool = False,
-    auto_mask: bool = False,
-    mended_lights: Path | None = None,
+    options: InfoOptions, reading: Reading | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the corrected lights, and return the report.
 
-    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also warnings. The other
-    arguments are as in the help of `info`. Raises InputError, OutputError, or UsageError if the plot would be in the
-    folder of the images, or options contradict each other.
+    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also warnings. Raises
+    InputError, OutputError, or UsageError if the plot would be in the folder of the images, or options contradict.
     """
-    reading = reading or Reading()
-    for name, given in (("--check-lights", check_lights), ("--mended-lights", mended_lights is not None)):
+    reading, plot, mended_lights = reading or Reading(), options.plot, options.mended_lights
+    for name, given in (("--check-lights", options.check_lights), ("--mended-lights", mended_lights is not None)):
         if given and reading.finds_lights:
             raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
     with TemporaryDirectory() as frames:  # extracted from a film
-        source = reading.open(unpacked(capture, Path(frames), reading, observer, redo="all"))
+        source = reading.open(unpacked(options.capture, Path(frames), reading, observer, redo="all"))
         common_size(source.facts)  # as in `infer`
-        if auto_mask:
+        if options.auto_mask:
             with observer.progress("finding the object", source.n_lights) as advance:
                 source = source.find_mask(lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
                 problem = f"the plot {plot} would be in the folder of the images and count as an image of the capture"
                 raise UsageError(problem, hint="Choose another folder for it")
-            check_free(plot.parent, [plot.name], overwrite=overwrite)
+            check_free(plot.parent, [plot.name], overwrite=options.overwrite)
         if mended_lights is not None:
             check_writable(mended_lights)
             if source.lamps is not None and source.lamps.used:
                 raise UsageError("--mended-lights writes directions, but the lights are near lamps")
-            check_free(mended_lights.parent, [mended_lights.name], overwrite=overwrite)
+            check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
         with observer.progress("reading", len(source.files.images)) as advance:
             summary = summarise_capture(source, progress=lambda: advance(1))
         summary, found_lights = _with_found_lights(summary)
@@ -103,7 +94,7 @@ def describe_capture(
             if mended is not None:
                 write_bytes(mended_lights, encode_lights(mended_lights, mended, source.files.images))
             report["mended_lights"] = None if mended is None else str(mended_lights)
-        if check_lights:
+        if options.check_lights:
             report["light_candidates"] = [] if check is None else candidate_rows(check)
         return report
 
