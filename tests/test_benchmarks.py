@@ -20,7 +20,6 @@ from splinecli.networks.weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
-
 Run = Callable[..., str]
 
 

@@ -164,7 +164,6 @@ WHITE_LEVEL = WarningKind("white_level",
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
-
 SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
 
 

@@ -20,7 +20,6 @@ FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
 PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")  # of the other commands
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
-
 CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values shown as white in the pictures by default
 BYTES_OF_SURFACE = 600  # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 

@@ -27,7 +27,6 @@ PANELS = (
 )
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
-
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
 NotNegative = Annotated[float, Meta(ge=0)]

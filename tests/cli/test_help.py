@@ -15,8 +15,6 @@ from splinecli.output_files import own_files
 from splinecli.results.pages import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-
-
 COMMANDS = ["infer", "watch", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pickle
+import random
 import re
 from pathlib import Path
 from unittest.mock import Mock
@@ -15,9 +16,9 @@ from capture.test_cyclesps import write_object
 from cli.conftest import read_report
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.estimator import LeastSquares
-from splinecli.pipeline.batch import infer_batch, worst_exit_code
+from splinecli.pipeline.batch import infer_batch, list_captures, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions, Shard
 from splinecli.system.files import NoRoomError
 from splinecli.system.progress import Observer
 
@@ -307,3 +308,32 @@ def test_images_in_place_of_their_folder(run, capture):
     result = run("infer", *sorted(capture.glob("image*.png")), "--method", "ls")
     expected = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
     assert (result.code, result.err) == (2, expected)
+
+
+@pytest.mark.parametrize(("count", "captures"), [(1, 5), (3, 0), (7, 23), (40, 23)])
+def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
+    """Each shard sees the folders in an order of its own, as shells of different languages give it."""
+    names = [f"{'aBéz'[index % 4]}{index}" for index in range(captures)]
+    for name in names:
+        (tmp_path / name).mkdir()
+    rng, parts = random.Random(0), []
+    for number in range(1, count + 1):
+        folders = [tmp_path / name for name in rng.sample(names, captures)]
+        parts.append([member.name for member in list_captures(folders, Shard(number, count))])
+        assert parts[-1] == [folder.name for folder in folders if folder.name in parts[-1]]
+    assert sorted(name for part in parts for name in part) == sorted(names)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+@pytest.mark.parametrize("text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"])
+def test_other_shards_are_refused(text):
+    with pytest.raises(UsageError, match="--shard is"):
+        Shard.parse(text)
+
+
+def test_captures_of_one_name_in_different_shards(tmp_path):
+    folders = [tmp_path / place / "same" for place in "ab"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    with pytest.raises(UsageError, match="have the same name"):
+        list_captures([*folders, Path("none")], Shard(1, 3))

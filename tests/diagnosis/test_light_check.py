@@ -20,8 +20,6 @@ from splinecli.maths.normals import unit
 Array = NDArray[np.float64]
 SIZE = 64
 SHIFTED = "if image 1 belongs to light 2, image 2 to the next, and so on"
-
-
 ring = partial(ring_lights, zenith_deg=40, first_rad=0.3)
 # Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise
 shade = partial(scenes.shade, gloss=0.3, noise=0.01)

@@ -26,7 +26,6 @@ from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-
 GB = 10**9
 
 

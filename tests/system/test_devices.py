@@ -1,5 +1,6 @@
-"""Devices, precision and threads."""
+"""Devices, precision, threads, memory and optional packages."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from splinecli.errors import UsageError
 from splinecli.system import machine
-from splinecli.system.machine import available_memory, cgroup_quotas, choose_device, choose_precision
+from splinecli.system.machine import available_memory, cgroup_quotas, choose_device, choose_precision, import_extra
 
 
 @pytest.mark.parametrize(
@@ -126,3 +127,16 @@ def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     monkeypatch.setattr(machine, "count_available_cores", lambda: cores)
     machine.use_available_cores()
     assert now[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "named"),
+    [
+        ("embreex.rtcore_scene", "render", "embreex and scikit-image"),
+        ("fast_simplification", "mesh", "fast-simplification"),
+    ],
+)
+def test_the_message_names_the_packages_and_the_command(module, extra, named, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=rf"{named}.*Run pip install 'splinecli\[{extra}\]'"):
+        import_extra(module, extra)

@@ -23,8 +23,6 @@ from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import LOCK, UNDONE, BusyError, held_folder, locked, locked_file, new_files
 
 REPORT = "report.json"
-
-
 OLD = {REPORT: b"old", "a.txt": b"old a", "only old.txt": b"old", "pictures/1.png": b"old 1"}
 NEW = {REPORT: b"new", "a.txt": b"new a", "only new.txt": b"new", "pictures/2.png": b"new 2"}
 MINE = {"notes.txt": b"mine"}

@@ -9,8 +9,6 @@ from types import FrameType
 
 INTERRUPTED = 130  # exit code of an interrupted process
 GRACE_SECONDS = 1.5  # time that the command has to clean up
-
-
 TOLD = threading.Event()  # set when the command reports the interruption itself, to avoid a second message
 DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
 

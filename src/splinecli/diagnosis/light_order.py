@@ -38,7 +38,6 @@ _RANDOM = 0.05  # of the brightness; below it, free intensities do not determine
 _FEWEST_IN_RING = 4
 _EQUAL = 1e-3  # share of the residual by which equal readings may differ
 _FITTED_PIXELS, _FITS = 800, 5
-
 UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
 # Readings of the light file in words: it has zenith angles, or lights half-way to the camera axis.
 ZENITH = "if their elevations count from the camera axis"

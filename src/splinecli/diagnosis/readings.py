@@ -25,18 +25,13 @@ from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
-
 _EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 _WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-
 COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
 LIKELY = 0.5  # probability from which a reading is named
-
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
-
-
 _SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
 

@@ -19,9 +19,7 @@ _LEFT = 0.5  # the share of the residual that a shift leaves, in the whole image
 _MANY_IMAGES = 10
 _DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and an offset
 _PASSES, _FITS = 2, 5
-
 Shift = tuple[int, int]  # right, down
-
 _NO_SHIFT = 0.0, (0, 0)
 
 

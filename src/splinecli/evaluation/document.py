@@ -29,7 +29,6 @@ _MOST_SENTENCES = 3  # pairs, as with three methods; more pairs are easier to re
 _MINUS = "\N{MINUS SIGN}"
 _RESTORED = "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does"
 _AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
-
 Mark = Literal["", "star", "best"]
 
 
@@ -188,7 +187,6 @@ def _count(number: int, noun: str) -> str:
 
 
 _DIGITS = 4  # decimal places of degrees and seconds
-
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 
 

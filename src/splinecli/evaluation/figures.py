@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_CAPTURES = 4  # with a panel each. With more, only the average is plotted, to keep the figure legible
-
 _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths

@@ -15,7 +15,6 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
-
 DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3  # of the seeds: draws, noise and choice of pixels are independent
 
 

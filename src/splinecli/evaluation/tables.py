@@ -22,7 +22,6 @@ from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ
-
 _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are considered equal
 
 

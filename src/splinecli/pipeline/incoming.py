@@ -76,8 +76,6 @@ def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
 
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
-
-
 SECONDS_BETWEEN_FILES = 60.0
 """Interval between checks of the files of a capture that was already returned. In between, only its folders are
 checked: their times change when a file is added, removed or replaced, but not when one is overwritten in place."""

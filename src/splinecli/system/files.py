@@ -218,7 +218,6 @@ def write_text(path: Path, content: str) -> None:
 
 
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
-
 StrPath = str | os.PathLike[str]  # a path in any form that the standard library takes
 
 

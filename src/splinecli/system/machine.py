@@ -245,7 +245,6 @@ def cgroup_quotas() -> list[float]:
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-
 _lock, _users, _threads = Lock(), 0, 0
 
 

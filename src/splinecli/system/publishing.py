@@ -123,7 +123,6 @@ def _try_lock(file: IO[str]) -> bool:
 
 
 Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
-
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
 
