@@ -195,7 +195,12 @@ def capture_features(
         shadow=float(1 - lit.mean()),
         dark=float(1 - kept.mean()),
     )
-    return features, replace(scale, turning=max(near[0], 0.0) * _turning(lights))
+    # By how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)
+    solve = np.linalg.pinv(lights)
+    turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
+    for axis in range(2):
+        turning[:, axis, axis] -= solve.sum(axis=1)
+    return features, replace(scale, turning=max(near[0], 0.0) * np.asarray(turning))
 
 
 def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
@@ -214,15 +219,6 @@ def _residuals_under(
         left = values - albedo[:, None] * cosines
         weights = seen * absolute_weights(left)
     return np.asarray(left)
-
-
-def _turning(lights: Float64Array) -> Float64Array:
-    """Return by how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)."""
-    solve = np.linalg.pinv(lights)
-    turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
-    for axis in range(2):
-        turning[:, axis, axis] -= solve.sum(axis=1)
-    return np.asarray(turning)
 
 
 def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, float, float, float]:

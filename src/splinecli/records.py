@@ -176,7 +176,6 @@ def limits(kind: Any) -> Meta:
 
 
 def _metadata(kind: Any) -> Iterator[Any]:
-    """Yield the annotations of a type and its parts."""
     yield from getattr(kind, "__metadata__", ())
     for part in get_args(kind):
         yield from _metadata(part)

@@ -115,7 +115,6 @@ class Command(TyperCommand):
 
 
 def _expand(value: Any) -> Any:
-    """Return a value with `~` and `~user` at the beginning of a text or path replaced by the home folder."""
     if isinstance(value, str | Path) and not isinstance(value, Enum):
         return type(value)(os.path.expanduser(value))  # noqa: PTH111 - Path.expanduser raises for an unknown user
     if isinstance(value, list | tuple):
@@ -212,7 +211,6 @@ class UntilClosed:
         return getattr(self._stream, name)
 
     def _mute(self) -> None:
-        """Redirect the stream, including its buffered output, to the null device."""
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, self._stream.fileno())
         os.close(null)

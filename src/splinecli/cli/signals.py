@@ -60,7 +60,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(reader: int) -> None:
-    """Read the numbers of the signals that arrive, and end the process some time after a SIGTERM."""
     while os.read(reader, 1) != bytes([signal.SIGTERM]):
         pass
     time.sleep(GRACE_SECONDS)

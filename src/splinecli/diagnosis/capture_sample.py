@@ -155,7 +155,6 @@ class CaptureSample:
         return check_lights(values[known], mask, self.all_directions, self.indices, self.names, factors)
 
     def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
-        """Return shifts by place, in pixels of the sample."""
         step = self.sample.step
         return {shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts}
 

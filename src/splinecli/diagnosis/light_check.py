@@ -213,7 +213,6 @@ def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -
 
 
 def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:
-    """Return the candidate with x and y negated in addition."""
     matrix = BOTH_NEGATED.matrix @ one.matrix
     return next((other for other in candidates if np.allclose(other.matrix, matrix, atol=1e-6)), None)
 

@@ -70,7 +70,13 @@ def mend_rings(factors: Factors, lights: Float64Array) -> tuple[str, Float64Arra
     least = min(each.misfit for each in found)
     near_least = (each for each in found if each.misfit <= least * (1 + _EQUAL) + _EQUAL)
     best = min(near_least, key=lambda each: (len(each.rings), sum(len(words) for _, words in each.rings)))
-    return _in_words(best.rings), best.lights, best.misfit
+    parts: dict[str, list[str]] = {}  # the lights of rings by their correction: "with lights 9 to 16 shifted by +1"
+    for lamps, words in best.rings:
+        whole = len(lamps) == lamps[-1] - lamps[0] + 1
+        numbers = f"{lamps[0] + 1} to {lamps[-1] + 1}" if whole else ", ".join(map(str, lamps + 1))
+        parts.setdefault(words, []).append(numbers)
+    named = "; ".join(f"lights {', '.join(numbers)} {words}" for words, numbers in parts.items())
+    return f"with {named}" if named else "", best.lights, best.misfit
 
 
 class _Mended(NamedTuple):
@@ -157,17 +163,6 @@ def _readings(given: Float64Array) -> Iterator[tuple[str, Float64Array]]:
         for way, (step, *signs) in _WAYS.items():
             directions = np.roll(given[::step], -steps, axis=0) * (*signs, 1)
             yield " and ".join(filter(None, (way, shift))), directions
-
-
-def _in_words(mended: Sequence[tuple[Integers, str]]) -> str:
-    """Return words for corrected rings, from their lights and their words: "with lights 9 to 16 shifted by +1"."""
-    parts: dict[str, list[str]] = {}
-    for lamps, words in mended:
-        whole = len(lamps) == lamps[-1] - lamps[0] + 1
-        numbers = f"{lamps[0] + 1} to {lamps[-1] + 1}" if whole else ", ".join(map(str, lamps + 1))
-        parts.setdefault(words, []).append(numbers)
-    named = "; ".join(f"lights {', '.join(lights)} {words}" for words, lights in parts.items())
-    return f"with {named}" if named else ""
 
 
 class Turn(NamedTuple):

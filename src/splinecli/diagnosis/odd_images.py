@@ -102,8 +102,13 @@ class ImageShift(NamedTuple):
 
 def find_shifts(sample: Sample) -> list[ImageShift]:
     """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
+    import cv2
+
     values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
-    inner = _inner(sample.mask)
+    # 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere
+    around = np.ones((2 * _LARGEST_SHIFT + 1, 2 * _LARGEST_SHIFT + 1), np.uint8)
+    eroded = cv2.erode(sample.mask.astype(np.float32), around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner = np.asarray(eroded, np.float32)
     # From fewer images, polished metals are predicted so badly that right images are named.
     if values.shape[1] < 10 or np.count_nonzero(inner) < 1000:
         return []
@@ -196,14 +201,6 @@ def _detail(values: Float32Array, mask: Bools) -> Float32Array:
     return np.asarray(detail.clip(-4.0, 4.0), np.float32)  # limits the weight of highlights
 
 
-def _inner(mask: Bools) -> Float32Array:
-    """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
-    import cv2
-
-    shifts = np.ones((2 * _LARGEST_SHIFT + 1, 2 * _LARGEST_SHIFT + 1), np.uint8)
-    return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))
-
-
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
 
 
@@ -258,7 +255,10 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     if (right, down) == (0, 0) or before - after < 1.5 or after > most_left * before:
         return []
     known = normals.any(axis=2) & truth.any(axis=2)
-    if after > most_left * _rotated_angle_deg(normals[known], truth[known]):
+    # The median angle after the best rotation (Kabsch 1976)
+    left, _, right_vectors = np.linalg.svd(normals[known].T @ truth[known])
+    rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right_vectors)))) @ right_vectors
+    if after > most_left * float(np.median(angle_between_deg(normals[known], truth[known] @ rotation.T))):
         return []
     directions = ((right, "right", "left"), (down, "down", "up"))
     named = " and ".join(
@@ -269,13 +269,6 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
         f" a shift of {named} is undone: it is probably shifted against the images, so the errors mean nothing."
     )
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
-
-
-def _rotated_angle_deg(normals: Float64Array, truth: Floats) -> float:
-    """Return the median angle between normals (P, 3) and a truth after the best rotation (Kabsch 1976)."""
-    left, _, right = np.linalg.svd(normals.T @ truth)
-    rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right)))) @ right
-    return float(np.median(angle_between_deg(normals, truth @ rotation.T)))
 
 
 def _angles_deg(normals: Float64Array, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:

@@ -20,7 +20,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import absolute_weights, fit_scaled_normals, lit_values, shade
-from splinecli.maths import Float64Array, Integers
+from splinecli.maths import Float64Array
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]
@@ -157,9 +157,14 @@ class Readings:
         fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in _WIDTHS}
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the position, like the light of near lamps. An object is round if its normals
-        # predict this share of the variance of the places; then near lamps cost so much more.
-        cost = 1.9 if _roundness(best.normals, places) > 0.85 else 0.0
+        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a cubic function
+        # of the slopes of its normals predicts this share of the variance of the places; near lamps then cost more.
+        across = unit(best.normals)[:, :2]
+        cubic = across * (across**2).sum(axis=1, keepdims=True)
+        terms = np.concatenate((across, cubic, np.ones((len(across), 1))), axis=1)
+        missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
+        roundness = float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
+        cost = 1.9 if roundness > 0.85 else 0.0
         # At an end of the distances, the residual may fall beyond.
         cost += 1.3 if best.amount in (_WIDTHS[0], _WIDTHS[-1]) else 0.0
         return replace(best, evidence=best.evidence - cost)
@@ -264,11 +269,3 @@ def _intensities(
     found = np.clip(found / found.mean(), 0.05, 20)
     intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
     return np.asarray(intensities / intensities.mean())
-
-
-def _roundness(normals: Float64Array, places: Integers) -> float:
-    """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
-    across = unit(normals)[:, :2]
-    terms = np.concatenate((across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1)
-    missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
-    return float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))

@@ -111,7 +111,7 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
-    """Return a table of methods by evaluations, made from the last column of each evaluation's table."""
+    """Return a table of methods by evaluations, the last columns of their tables."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
         columns.append([Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])])
@@ -136,7 +136,6 @@ def _error_table(evaluation: Evaluation) -> Table:
 
 
 def _seconds_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures: seconds per trial."""
     seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
     body = [
         [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]

@@ -193,7 +193,6 @@ def latex(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Return the text on one line, escaped so that Markdown shows it unchanged."""
     return re.sub(r"([\\`*<>|\[\]&~])", r"\\\1", " ".join(text.split()))
 
 

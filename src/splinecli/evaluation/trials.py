@@ -117,7 +117,6 @@ class TrialStore:
 
 
 def _read_line(line: str) -> tuple[str, Score] | None:
-    """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
         key, score = record["key"], Score(**{field.name: record.get(field.name) for field in fields(Score)})

@@ -294,7 +294,6 @@ class _Warnings(Observer):
 def _infer(
     options: InferOptions, redo: Redo, sha256: str | None, number: int, member: BatchItem
 ) -> tuple[Outcome, list[str]]:
-    """Compute a capture on a worker, and return its outcome and the warnings."""
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):

@@ -129,7 +129,6 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
 
 
 def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
-    """Run integrate_normal_map in the folder of results, which the caller has locked."""
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
