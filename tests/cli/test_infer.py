@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -107,13 +108,12 @@ def darken_background(capture):
     return mask
 
 
-def test_a_mask_is_found_where_there_is_none(capture, run):
+def test_a_mask_is_found_where_there_is_none(capture, run, document):
     mask = darken_background(capture)
-    assert run("infer", capture, "--method", "ls", "--auto-mask").code == 0
-    assert "found_mask.png" not in read_report(Path("out/sphere"))["files"]  # the capture's own goes first
+    command = ("infer", capture, "--method", "ls", "--auto-mask", "--overwrite")
+    assert "found_mask.png" not in document(*command)["files"]  # the capture's own goes first
     (capture / "mask.png").unlink()
-    assert run("infer", capture, "--method", "ls", "--auto-mask", "--overwrite").code == 0
-    report = read_report(Path("out/sphere"))
+    report = document(*command)
     found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED)
     assert ("found_mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
     assert (found != mask).mean() < 0.02  # corners are rounded
@@ -125,7 +125,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (3, True, True)
 
 
-def test_photographs_with_a_curve_and_ambient_light(capture, run):
+def test_photographs_with_a_curve_and_ambient_light(capture, document):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):
         linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 65_535 * 0.8 + light
@@ -133,17 +133,15 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
     cv2.imwrite("dark.png", dark)
 
-    def mean_deg(*options):
-        run("infer", capture, "--method", "ls", "--overwrite", *options)
-        return read_report(Path("out/sphere"))["angular_error_deg"]["mean"]
-
-    assert mean_deg() > 5
-    assert mean_deg("--transfer", "gamma:2.2", "--ambient", "dark.png") < 0.1
+    report = partial(document, "infer", capture, "--method", "ls", "--overwrite")
+    assert report()["angular_error_deg"]["mean"] > 5
+    given = ("--transfer", "gamma:2.2", "--ambient", "dark.png")
+    assert report(*given)["angular_error_deg"]["mean"] < 0.1
     cv2.imwrite(str(capture / "ambient.png"), dark)
-    assert mean_deg("--transfer", "gamma:2.2") < 0.1
-    assert read_report(Path("out/sphere"))["warnings"] == [
-        {"code": "ambient_subtracted", "text": "ambient.png was subtracted from all images as ambient light."}
-    ]
+    found = report(*given[:2])
+    assert found["angular_error_deg"]["mean"] < 0.1
+    text = "ambient.png was subtracted from all images as ambient light."
+    assert found["warnings"] == [{"code": "ambient_subtracted", "text": text}]
 
 
 def test_a_mended_mask_stays(capture, document):

@@ -62,21 +62,19 @@ def test_the_same_command_continues(run, make_capture):
     assert "two" in result.err
     before = Path("set/one/observations.npy").stat()
     shutil.move("hidden.png", two / "image3.png")
-    assert run("prepare", one, two, "-o", "set").code == 0
+    assert run("prepare", one, two, "-o", "set").out.startswith("set: 2 entries of 2 scenes")
     assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
-    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {"one", "two"}
 
 
 def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     capture = make_capture("a")
     shutil.copytree(capture, "b/a")
-    assert run("prepare", capture, "b", capture, "-o", "set", "--quiet").code == 0
-    assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
-    # They keep their names in another order.
-    before = [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")]
-    assert run("prepare", "b", capture, "-o", "set", "--quiet").code == 0
-    assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
-    assert [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")] == before
+    times = []
+    for sources in ((capture, "b", capture), ("b", capture)):  # they keep their names in another order
+        assert run("prepare", *sources, "-o", "set", "--quiet").code == 0
+        assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
+        times.append([Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")])
+    assert times[0] == times[1]
 
 
 CHANGES = {
@@ -112,15 +110,9 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
     assert run("prepare", capture, "-o", "set", "--quiet").code == 0
     assert run("prepare", capture, "-o", "raw", "--as-stored", "--quiet").code == 0
-    for folder, reading in (("set", "restored"), ("raw", "as stored")):
-        (entry,) = json.loads(Path(folder, "manifest.json").read_text())["entries"]
-        assert entry["recipe"]["reading"] == reading
-    found = arrays("sphere")
-    stored = np.load("raw/sphere/observations.npy")
-    # The oracle: a matte sphere.
-    expected = found["normals"] @ found["light_directions"].T * 60_000 / 65_535
-    clipped = np.abs(stored - expected).max(axis=1) > 0.01
-    assert clipped.sum() > 20
+    found, stored = arrays("sphere"), np.load("raw/sphere/observations.npy")
+    expected = found["normals"] @ found["light_directions"].T * 60_000 / 65_535  # a matte sphere
+    assert (np.abs(stored - expected).max(axis=1) > 0.01).sum() > 20
     np.testing.assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
     refused = run("prepare", capture, "-o", "raw")
