@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from functools import lru_cache
 from math import isfinite
@@ -148,13 +149,11 @@ def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, stric
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
-    try:
+    with suppress(ValidationError):
         found = convert(value, kind, strict=strict)
         items = found.values() if isinstance(found, dict) else _each(found)
         if all(isfinite(item) for item in items if isinstance(item, float)):
             return found
-    except ValidationError:
-        pass
     raise error(f"{title} is {value!r}; expected {in_words(kind)}")
 
 

@@ -19,7 +19,7 @@ from splinecli.errors import printable
 from splinecli.evaluation import protocol as protocol_module
 from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
-from splinecli.evaluation.protocol import Evaluation, Protocol, all_captures, heading, lights_value
+from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.tables import AVERAGE, Comparison, compare, table_rows
 from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
@@ -49,10 +49,10 @@ def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, 
     `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are sentences about the
     captures.
     """
-    first = evaluations[0]
+    first, captures = evaluations[0], _captures(evaluations)
     return render(
         "report.html",
-        title=f"{_count(len(first.methods), 'method')} on {_count(len(all_captures(evaluations)), 'capture')}",
+        title=f"{_count(len(first.methods), 'method')} on {_count(len(captures), 'capture')}",
         protocol=_protocol(evaluations),
         notes=notes,
         skipped=[(s.capture, s.reason) for s in protocol_module.all_skipped(evaluations)],
@@ -66,7 +66,7 @@ def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, 
 
 def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     first = evaluations[0].protocol
-    lights = dict.fromkeys(protocol_module.lights_in_words(e.protocol) for e in evaluations)
+    lights = dict.fromkeys(f"{lights_value(e.protocol)} lights" for e in evaluations)
     noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
     drawn = "at random from the seed" if first.draws_file is None else f"those of {first.draws_file.name}"
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
@@ -84,7 +84,7 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     return [
         ("Methods", ", ".join(evaluations[0].methods)),
         *([("Weights", ", ".join(weights))] if weights else []),
-        ("Captures", ", ".join(all_captures(evaluations))),
+        ("Captures", ", ".join(_captures(evaluations))),
         ("Image values", _AS_STORED if first.as_stored else _RESTORED),
         ("Lights", ", ".join(lights)),
         ("Trials", " or ".join(map(str, trials))),
@@ -179,6 +179,10 @@ def _figure(caption: str, png: bytes) -> dict[str, Any]:
 
 def _signed(value_deg: float) -> str:
     return f"{value_deg:+.2f}".replace("-", _MINUS)
+
+
+def _captures(evaluations: Sequence[Evaluation]) -> list[str]:
+    return list(dict.fromkeys(capture for e in evaluations for capture in e.captures))
 
 
 def _count(number: int, noun: str) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError, printable
-from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_in_words
+from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.run import draws_for, read_draws_file
 from splinecli.evaluation.tables import AVERAGE, trial_averages
 from splinecli.evaluation.trials import Trial, TrialSource
@@ -62,7 +62,7 @@ def light_noise_curves(evaluations: Sequence[Evaluation]) -> bytes:
         evaluations,
         x=lambda e, _: e.protocol.light_noise_deg,
         tick=lambda _, x: f"{x:g}",
-        series=lambda e: lights_in_words(e.protocol),
+        series=lambda e: f"{lights_value(e.protocol)} lights",
         label="light noise (standard deviation, deg)",
         logarithmic=False,
     )

@@ -134,23 +134,16 @@ class Protocol:
     Raises UsageError if a value is out of its range.
     """
 
-    # in each draw. None means all lights of a capture. A draws file overrides this field and trials.
-    n_lights: int | None = None
+    n_lights: int | None = None  # in each draw; None for all. A draws file overrides this field and trials
     trials: int = 1  # the number of random draws. Without light noise, a draw of all lights needs only one trial.
     seed: int = 0  # for the draws, the light noise and the choice of pixels
     draws_file: Path | None = None  # file that provides the draws instead; see read_draws
     light_noise_deg: float = 0.0  # standard deviation of the angle by which each trial tilts the light directions
-    # number of randomly chosen pixels to score in each capture. None scores all pixels that have ground truth.
-    max_pixels: int | None = None
-    # number of images to skip at the start, by the name of the capture; EVERY_CAPTURE for all others
-    skip_first: Mapping[str, int] = field(default_factory=dict)
-    # score the stored values only, as the published tables do. By default, saturated observations are restored and
-    # unknown light intensities are estimated, as in `infer`.
-    as_stored: bool = False
+    max_pixels: int | None = None  # to score in each capture, chosen at random; None for all with ground truth
+    skip_first: Mapping[str, int] = field(default_factory=dict)  # images, by the name of the capture or EVERY_CAPTURE
+    as_stored: bool = False  # whether the stored values are scored, as in published tables, or read as in `infer`
     white_level: float | None = None
-    # typical error of the light directions, with which each trial refines them (see refine_capture). None disables the
-    # refinement.
-    light_error_deg: float | None = None
+    light_error_deg: float | None = None  # typical error with which trials refine the lights (see refine_capture)
     finds_lights: bool = False  # whether trials estimate their lights from the images, as `infer --lights estimate`
 
     def __post_init__(self) -> None:
@@ -164,19 +157,13 @@ class Protocol:
 
 
 def lights_value(protocol: Protocol) -> int | Literal["all"]:
-    """Return the number of lights in each draw, or "all"."""
     return "all" if protocol.n_lights is None else protocol.n_lights
-
-
-def lights_in_words(protocol: Protocol) -> str:
-    """Return the number of lights in a draw as text: "10 lights", "all lights"."""
-    return f"{lights_value(protocol)} lights"
 
 
 def heading(protocol: Protocol) -> str:
     """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
     noise = f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
-    return lights_in_words(protocol) + noise
+    return f"{lights_value(protocol)} lights{noise}"
 
 
 def protocol_in_words(protocol: Protocol) -> str:
@@ -210,8 +197,7 @@ class Result:
     n_lights: int  # number of lights in each draw
     maes_deg: tuple[float, ...]  # mean angular error (MAE) over the scored pixels, in degrees, of each trial
     seconds: float  # mean time to estimate the normals in a trial
-    # mean error of the light directions estimated by the trials; None if they were not estimated
-    found_light_error_deg: float | None = None
+    found_light_error_deg: float | None = None  # mean error of light directions that the trials estimated
 
     @property
     def trials(self) -> int:
@@ -244,7 +230,7 @@ class Evaluation:
     results: tuple[Result, ...]  # one per capture and method, ordered by capture as given, then by method
     skipped: tuple[Skipped, ...] = ()  # the captures that could not be scored
     notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
-    # {"weights", "device", "precision", "fingerprint"} of each method by name; see Estimator
+    # "weights", "device", "precision" and "fingerprint" of each method by name; see Estimator
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -262,11 +248,6 @@ class Evaluation:
             method: math.fsum(r.mae_deg for r in self.results if r.method == method) / len(self.captures)
             for method in self.methods
         }
-
-
-def all_captures(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Return the names of the captures scored by any of the evaluations, without duplicates."""
-    return list(dict.fromkeys(capture for e in evaluations for capture in e.captures))
 
 
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[Skipped]:

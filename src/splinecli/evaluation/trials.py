@@ -72,8 +72,7 @@ class Score:
     mae_deg: float  # mean angular error over the scored pixels
     seconds: float  # time spent on estimating their normals
     estimated_intensities: bool  # whether the light intensities were estimated from the images
-    # mean error of the light directions estimated from the images; None if they were not estimated
-    found_light_error_deg: float | None = None
+    found_light_error_deg: float | None = None  # mean error of light directions that were estimated from the images
 
 
 class TrialStore:
@@ -129,8 +128,7 @@ def _read_line(line: str) -> tuple[str, Score] | None:
 
 OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
-DAMAGED_IMAGES = {"bearPNG": 20}
-"""The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
+DAMAGED_IMAGES = {"bearPNG": 20}  # the first 20 of DiLiGenT's Bear are corrupted, as users of the benchmark reported
 
 
 @dataclass(frozen=True)

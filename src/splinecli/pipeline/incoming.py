@@ -5,6 +5,7 @@ import os
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,20 +66,18 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
 
 def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
     """Return the stamp of the film whose frames are in the folder, and their sizes; empty without such frames."""
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         record = read_json(folder / _RECORD)
         frames = {str(name): int(size) for name, size in record["frames"].items()}
         if len(frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, frames)):
             return str(record["sha256"]), frames
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass
     return "", {}
 
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
+# Interval between checks of the files of a capture that was already returned. In between, only its folders are checked:
+# their times change when a file is added, removed or replaced, but not when one is overwritten in place.
 SECONDS_BETWEEN_FILES = 60.0
-"""Interval between checks of the files of a capture that was already returned. In between, only its folders are
-checked: their times change when a file is added, removed or replaced, but not when one is overwritten in place."""
 
 
 @dataclass
@@ -154,10 +153,9 @@ class Arrivals:
 
 
 def _changed(folder: str) -> int:
-    try:
+    with suppress(OSError):
         return os.stat(folder).st_mtime_ns  # noqa: PTH116 - see _stamp
-    except OSError:
-        return -1
+    return -1
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:

@@ -4,6 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -232,15 +233,13 @@ def _report_of(path: Path) -> dict[str, Any] | None:
             return None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    try:
+    with suppress(ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
         convention, discontinuity = report["options"]["convention"], float(report["options"]["discontinuity"])
         if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
             return report
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
-        pass
     problem = "is damaged, or from another version: it does not say how the normal map beside it was made"
     hint = "Run 'splinecli infer' again, or move the normal map to another folder"
     raise InputError(problem, path=path.parent / REPORT, hint=hint)

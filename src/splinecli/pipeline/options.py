@@ -4,6 +4,7 @@
 # fmt: off
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -31,12 +32,10 @@ DEFAULT_LIGHTS = 10
 
 def parse_circle(text: str) -> tuple[float, float, float]:
     """Return the numbers in a text "X,Y,R". Raises UsageError."""
-    try:
+    with suppress(ValueError):
         x, y, radius = (float(word) for word in text.split(","))
         if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
             return x, y, radius
-    except ValueError:
-        pass
     raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
 
 

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from typing import Protocol
 
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
+# The stages in order, except for page.html, which is one of the pictures but is written after the surface
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
-"""The stages in order, except for page.html, which is one of the pictures but is written after the surface."""
 
 
 class Clock:
