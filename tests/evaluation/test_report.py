@@ -3,7 +3,7 @@
 import base64
 import re
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import cv2
 import numpy as np
@@ -24,15 +24,12 @@ def all_of(page: HtmlPage, tag: str) -> list[dict[str, str | None]]:
 
 def evaluation_of(methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10) -> Evaluation:
     generator = np.random.default_rng(3)
-    return Evaluation(
-        Protocol(n_lights, trials, seed=7, max_pixels=500),
-        tuple(
-            Result(method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25)
-            for capture in captures
-            for m, method in enumerate(methods)
-        ),
-        (Skipped("bear", "bear: no images."),),
+    results = tuple(
+        Result(method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25)
+        for capture, (m, method) in product(captures, enumerate(methods))
     )
+    protocol = Protocol(n_lights, trials, seed=7, max_pixels=500)
+    return Evaluation(protocol, results, (Skipped("bear", "bear: no images."),))
 
 
 def test_one_evaluation() -> None:
