@@ -2,10 +2,8 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -202,22 +200,6 @@ def test_interrupted_while_estimating(capture, run, monkeypatch):
     result = run("infer", capture, "--method", "ls")
     assert (result.code, result.out, result.err) == (130, "", "splinecli: interrupted.\n")
     assert not Path("out").exists()
-
-
-@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-def test_ctrl_c_ends_a_real_process(capture):
-    command = [sys.executable, "-m", "splinecli", "train", "-o", "run", "--minutes", "10"]
-    # A shell starts background jobs with SIGINT ignored, and these tests may run in one.
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
-    )
-    while not Path("run/config.json").exists():
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
-    assert not [path.name for path in Path("run").iterdir() if path.name.startswith(".")]  # nothing half-written
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX redirections")
