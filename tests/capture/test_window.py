@@ -16,7 +16,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.inference import lighting_on
 from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
 from splinecli.surface.pixel_grid import pixel_rays
 
@@ -82,7 +82,7 @@ def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str |
 
 def test_windows_in_words() -> None:
     assert parse_window(*WINDOWS[2]).in_words() == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
-    assert describe_capture(MEDALLION)["reads"] is None
+    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
 @pytest.mark.parametrize(

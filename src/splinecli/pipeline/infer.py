@@ -1,12 +1,11 @@
 """Estimate the normals of one capture: read it, check it, run the method, write the results.
 
-Both `infer` and splinecli.estimate_normals use this code, with all checks and warnings. On large captures, or on
-request, a distilled estimator replaces the network.
+Both `infer` and splinecli.estimate_normals use this code. A distilled estimator may replace the network.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -52,16 +51,14 @@ if TYPE_CHECKING:
 BASE_BYTES = 500 * 2**20  # for Python, PyTorch and a batch of pixels; captures and their refinement need more
 REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # most pixels refined at once (a tile with its margin); bytes per pixel
 
-INDIRECT_BYTES = 4  # per pixel of the capture, for its indirect light
-_WORTH_A_MASK = 10**9  # bytes above which the mask is read, to find out how many of them are needed
-
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the memory in bytes that spline-net needs for a capture, in addition to BASE_BYTES.
 
     It follows from the size of the largest image, the number of pixels in the mask and the number of images read.
     """
-    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    of_indirect_light = 4 * n_pixels
+    of_pixels = of_indirect_light + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
 
@@ -77,19 +74,17 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         n_lights = n_lights or source.n_lights
         n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
         n_bytes = infer_bytes(size, n_pixels, n_lights)
-        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
+        is_large = n_bytes > 10**9  # so that it is worth reading the mask
+        if is_large and (source.files.mask is not None or source.files.boundaries):
             n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
     except (SplinecliError, OSError, MemoryError):
         return 0.0
     return float(n_bytes)
 
 
+# Pixels from which a capture is distilled by default; not timed at run time, because the machine's load must not change
+# the normals. From this size on, distillation takes less than half of the network's time on 1 to 16 cores and an H100.
 AUTOMATIC_FROM = 100_000
-"""Pixels from which a capture is distilled by default.
-
-This is a constant and not timed at run time, because the machine's load must not change the normals. From this size on,
-distillation takes less than half of the network's time on 1 to 16 cores and on an H100, under 10 and 96 lights.
-"""
 
 
 def distil_for(
@@ -100,13 +95,19 @@ def distil_for(
     Under near lamps, the capture must contain its surface points. With `wanted` = None, AUTOMATIC_FROM decides. Raises
     UsageError if distillation is requested, but the method does not estimate a confidence, or the capture is too small.
     """
+
+    def refuse(problem: str) -> tuple[None, list[CaptureWarning]]:
+        if wanted:
+            raise UsageError(problem, hint="Leave --distil out")
+        return None, []
+
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not estimator.has_confidence:
-        return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
+        return refuse(f"method {estimator.name} gives no confidence and cannot be distilled")
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
-        return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
+        return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
     teacher = estimator.bind(lighting_at, capture.n_pixels)
     from splinecli.methods.distilled import distil
@@ -116,7 +117,7 @@ def distil_for(
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
                 distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
-            return _refuse(wanted, f"{capture.name}: {error.problem}")
+            return refuse(f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
             return distilled, []
     text = (
@@ -125,12 +126,6 @@ def distil_for(
         f" {distilled.distillation.expected_deg:.1f} degrees."
     )
     return None, [CaptureWarning(NOT_DISTILLED, text)]
-
-
-def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:
-    if wanted:
-        raise UsageError(problem, hint="Leave --distil out")
-    return None, []
 
 
 _STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # the clock's names
@@ -211,13 +206,12 @@ def infer_capture(
         source, capture = _read(folder, options, observer)
         estimator = estimator or make_method(options)
         _check_results(capture, folder, options)
+        refine = partial(refine_capture, intensities_known=source.intensities_known)
         estimate, distilled = estimate_capture(
             capture,
             estimator,
             partial(check_capture, source, strict=options.strict),
-            refine_lights=partial(refine_capture, intensities_known=source.intensities_known)
-            if options.refine_lights
-            else None,
+            refine_lights=refine if options.refine_lights else None,
             distil=options.distil,
             strict=options.strict,
             observer=observer,
@@ -294,13 +288,10 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
     costly = [row.name for row in chosen_maps(options.maps, page=options.html) if row.bytes_per_pixel]
     avoidable = [f"--maps {name}" for name in costly if name in options.maps]
     avoidable += ["--html"] * options.html + ["--surface"] * options.surface
-    check_memory(
-        results_bytes(capture.n_pixels, capture.n_lights, maps=costly, surface=options.surface),
-        f"the results of {capture.n_pixels} pixels take",
-        folder,
-        hint="Mask the object, or use --scale or --crop"
-        + (f", or leave out {' and '.join(avoidable)}" if avoidable else ""),
-    )
+    hint = "Mask the object, or use --scale or --crop"
+    hint += f", or leave out {' and '.join(avoidable)}" if avoidable else ""
+    needed = results_bytes(capture.n_pixels, capture.n_lights, maps=costly, surface=options.surface)
+    check_memory(needed, f"the results of {capture.n_pixels} pixels take", folder, hint=hint)
     if options.surface:
         check_triangles(capture.mask, folder)
 
@@ -310,11 +301,8 @@ def _check_light_files(target: Path) -> None:
     own = files.own_light_files(target)
     for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
-            raise OutputError(
-                "the file is not from an earlier run, and --lights estimate would overwrite it",
-                path=target / name,
-                hint="Choose another -o",
-            )
+            problem = "the file is not from an earlier run, and --lights estimate would overwrite it"
+            raise OutputError(problem, path=target / name, hint="Choose another -o")
 
 
 def _make_files(
@@ -340,9 +328,16 @@ def _make_files(
         if values is not None:
             made[row.name] = values
     scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
+
+    def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
+        """Yield the files of a map, which is computed when they are written unless it already exists."""
+        values = made[row.name] if row.name in made else make_map(row, source, estimate)
+        if values is not None:
+            yield from map_files(row, values, capture.mask, options.formats, scale=scales.get(row.name))
+
     found: list[Iterable[tuple[str, Content]]] = [
         files.normal_files(estimate, options.formats, options.convention),
-        *(_map_files(row, made, source, estimate, options.formats, scales) for row in chosen_maps(options.maps)),
+        *map(map_of, chosen_maps(options.maps)),
     ]
     light_plot = None
     if capture.light_errors_deg is not None:
@@ -378,20 +373,6 @@ def _make_files(
         )
         found.append([(PAGE, page)])
     return found
-
-
-def _map_files(
-    row: OutputMap,
-    made: Mapping[str, NDArray[np.float32]],
-    source: CaptureSource,
-    estimate: NormalEstimate,
-    formats: Sequence[str],
-    scales: Mapping[str, float],
-) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map, which is computed now unless it already exists."""
-    values = made[row.name] if row.name in made else make_map(row, source, estimate)
-    if values is not None:
-        yield from map_files(row, values, estimate.capture.mask, formats, scale=scales.get(row.name))
 
 
 def results_bytes(n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False) -> int:

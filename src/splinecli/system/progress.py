@@ -6,9 +6,8 @@ from contextlib import contextmanager
 from typing import Protocol
 
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
-
+# The stages in order, except for page.html, which is one of the pictures but is written after the surface
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
-"""The stages in order, except for page.html, which is one of the pictures but is written after the surface."""
 
 
 class Clock:
@@ -26,10 +25,8 @@ class Clock:
 
     def seconds(self) -> dict[str, float]:
         """Return the seconds of each stage so far, and of all together as `total`."""
-        self.begin(self._stage)
-        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
-            "total": round(sum(self._seconds.values()), 3)
-        }
+        seconds = {stage: round(seconds, 3) for stage, seconds in self._seconds.items()}
+        return seconds | {"total": round(sum(self._seconds.values()), 3)}
 
 
 class Advance(Protocol):
@@ -39,10 +36,7 @@ class Advance(Protocol):
 
 
 class Observer:
-    """Receives messages, warnings and progress. This base class ignores them all.
-
-    A subclass overrides the methods for anything it shows.
-    """
+    """Receives messages, warnings and progress, and ignores them. A subclass overrides what it shows."""
 
     def say(self, message: str) -> None:
         """Receive a message for the user."""

@@ -23,6 +23,7 @@ from splinecli.capture.formats.images import check_stored_size, decode_image
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.light_files import read_light_directions
 from splinecli.errors import InputError
+from splinecli.pipeline.infer_options import InfoOptions
 from splinecli.pipeline.info import describe_capture
 
 HUGE = 30_000
@@ -154,14 +155,14 @@ def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, i
     for number in range(4):
         write_claim(tmp_path / f"{number}.png", *size)
     match = rf"0\.png: found an image of {size[1]} x {size[0]} pixels.* expected at most 400 megapixels"
-    refused(lambda: describe_capture(tmp_path), match)
+    refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), match)
     refused(lambda: open_capture(tmp_path).find_mask(), match)
     refused(lambda: open_capture(tmp_path).read_mask(size), match)
     refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full(SMALL, 99 + number, np.uint8))
     other = rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected {SMALL[1]} x {SMALL[0]} as in 0\.png"
-    refused(lambda: describe_capture(tmp_path), other)
+    refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), other)
 
 
 def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
