@@ -7,10 +7,9 @@ import pytest
 import quadprog
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from scenes import cap_directions, halfway
-from splinecli.fits.ia14 import fit, minimise_nonnegative, solve_ia14
+from splinecli.fits.ia14 import fit, solve_ia14
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 
@@ -119,23 +118,3 @@ def test_optimum_is_the_librarys(kind: str, count: int) -> None:
         optimum = expected @ hessian @ expected
         assert found @ hessian @ found == pytest.approx(optimum, rel=1e-6, abs=1e-9)
         assert angle_between_deg(n[None], expected[None, :3]).item() < 0.01
-
-
-@pytest.mark.parametrize("rows", [30, 7], ids=["well determined", "nearly singular"])
-def test_optimum_is_scipys(rows: int) -> None:
-    rng = np.random.default_rng(0)
-    # Columns alike make for many exchanges; with 7 rows for 10 unknowns the ridge alone makes the optimum unique.
-    matrices = rng.uniform(size=(100, rows, 10))
-    ridge = np.broadcast_to(1e-4 * np.eye(10), (100, 10, 10))
-    matrices = np.concatenate((matrices, ridge), axis=1)
-    signal = (matrices @ rng.uniform(-0.3, 1, size=(100, 10, 1)))[..., 0]
-    targets = signal + np.concatenate((0.1 * rng.normal(size=(100, rows)), np.zeros((100, 10))), axis=1)
-    hessian, linear = matrices.mT @ matrices, (matrices.mT @ targets[..., None])[..., 0]
-    found = minimise_nonnegative(torch.as_tensor(hessian), torch.as_tensor(linear)).numpy()
-    expected = np.stack([nnls(a, b)[0] for a, b in zip(matrices, targets, strict=True)])
-    assert 0.2 < (expected == 0).mean() < 0.8
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
-    gradient = (hessian @ found[..., None])[..., 0] - linear
-    assert found.min() >= 0
-    assert gradient.min() > -1e-9
-    assert np.abs(gradient * found).max() < 1e-9

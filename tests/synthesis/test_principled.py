@@ -105,48 +105,6 @@ def test_agrees_with_the_published_equations(surface: PrincipledMaterial) -> Non
         np.testing.assert_allclose(radiance(surface, normal, lights), expected, rtol=1e-5, atol=1e-12)
 
 
-def hemispherical_reflectance(
-    surface: PrincipledMaterial, normal: Vectors, *, rings: int = 400, sectors: int = 800
-) -> float:
-    """The integral of f cos over all lights above the surface, by the midpoint rule in azimuth and sin^2."""
-    sine_squared = (np.arange(rings) + 0.5) / rings
-    azimuth = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
-    s, a = (grid.ravel() for grid in np.meshgrid(np.sqrt(sine_squared), azimuth))
-    c = np.sqrt(1 - s**2)
-    # Cells of equal projected area about the normal, turned into the camera's frame (about the y axis).
-    x, y = s * np.cos(a), s * np.sin(a)
-    lights = np.stack((normal[2] * x + normal[0] * c, y, normal[2] * c - normal[0] * x), axis=1)
-    # Lights under the camera's horizon are none of ours (z < 0); shade() is defined for the upper half alone.
-    lights = lights[lights[:, 2] > 0]
-    # d(projected area) = cos dw, and radiance = pi f cos, so the integral is the mean of radiance / cos.
-    return float((radiance(surface, normal, lights) / (lights @ normal)).sum() / len(s))
-
-
-@pytest.mark.parametrize("tilt_deg", [0.0, 40.0, 75.0])
-@pytest.mark.parametrize(
-    ("surface", "limit"),
-    [
-        # Burley's diffuse lobe of roughness 1 gains at grazing angles; the model is only nearly conserving.
-        (material(base=1.0, roughness=1.0), 1.1),
-        (material(base=1.0, roughness=0.5), 1.02),
-        (material(base=1.0, roughness=0.5, metallic=1.0), 1.0),
-        (material(base=1.0, roughness=0.2, metallic=1.0), 1.0),
-        (material(base=1.0, roughness=0.4, metallic=1.0, tail_exponent=1.2), 1.0),
-        (material(base=0.0, roughness=0.3, specular=1.0), 0.3),
-    ],
-)
-def test_no_more_light_comes_out_than_goes_in(surface: PrincipledMaterial, limit: float, tilt_deg: float) -> None:
-    normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
-    reflectance = hemispherical_reflectance(surface, normal)
-    assert 0 < reflectance <= limit
-
-
-def test_a_smooth_metal_mirrors_nearly_everything() -> None:
-    # Single scattering loses little on so smooth a metal: a lobe of the wrong height would not come near 1.
-    up, metal = np.array([0.0, 0.0, 1.0]), material(base=1.0, roughness=0.2, metallic=1.0)
-    assert hemispherical_reflectance(metal, up, rings=100_000, sectors=4) == pytest.approx(1, abs=0.003)
-
-
 def test_float32_is_close_to_float64() -> None:
     generator = torch.Generator().manual_seed(0)
     surface = draw_material(200, generator)

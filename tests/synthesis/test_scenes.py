@@ -1,15 +1,11 @@
 """Scenes: reproducible one by one, and drawn from the stated ranges."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import CLASSES, draw_material, with_one_gloss
 from splinecli.synthesis.scenes import (
     MATERIALS,
     MIN_LIGHT_Z,
@@ -70,14 +66,6 @@ def test_lights_cover_the_upper_hemisphere() -> None:
     probes[:, 2] = np.abs(probes[:, 2])
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12
-
-
-def test_patches_of_one_gloss_differ_in_their_base_alone() -> None:
-    material = with_one_gloss(draw_material(50, torch.Generator().manual_seed(0), CLASSES["specular"]))
-    for field in fields(material):
-        values = getattr(material, field.name)
-        assert values.shape == (50, 1)
-        assert (len(values.unique()) > 1) == (field.name == "base"), field.name
 
 
 def test_patches_are_connected_areas_of_about_one_size() -> None:
