@@ -1,7 +1,6 @@
 """IA14: the inverse of image formation, with n.l as a monotone polynomial of the observation and of l.v.
 
-Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic surfaces, CVPR
-2014.
+Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic surfaces, CVPR 2014.
 """
 
 from math import comb

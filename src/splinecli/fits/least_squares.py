@@ -198,8 +198,7 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
     Equal observations are kept or left out together, so the order of the lights does not matter.
     """
     count = observations.shape[1]
-    # Share of the observations that is left out at each end: with ten lights, the two darkest and the two
-    # brightest.
+    # Share of the observations that is left out at each end: with ten lights, the two darkest and the two brightest.
     trimmed = max(0, min(int(0.2 * count), (count - FEWEST) // 2))
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]

@@ -92,7 +92,16 @@ def configure(
         raise ModelError("is nested too deeply", path=file) from None
     for change in changes:
         values = _merge(values, change)
-    return _with_absolute_paths(TrainingConfig.from_dict(values))
+    config = TrainingConfig.from_dict(values)
+
+    def absolute(path: str) -> str:  # so that a run can continue from another working folder
+        return str(expanded(path).absolute())
+
+    sources = {name if name == GENERATOR else absolute(name): weight for name, weight in config.sources.items()}
+    start_from = config.start_from
+    if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
+        start_from = absolute(start_from)
+    return replace(config, sources=sources, start_from=start_from)
 
 
 def check_resumable(started: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
@@ -106,19 +115,6 @@ def check_resumable(started: TrainingConfig, asked: TrainingConfig, path: Path) 
                 path=path,
                 hint="Leave the setting out to continue, or choose another -o",
             )
-
-
-def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
-    """Make paths absolute, so that a run can continue from another working folder."""
-    sources = {name if name == GENERATOR else _absolute(name): weight for name, weight in config.sources.items()}
-    start_from = config.start_from
-    if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
-        start_from = _absolute(start_from)
-    return replace(config, sources=sources, start_from=start_from)
-
-
-def _absolute(path: str) -> str:
-    return str(expanded(path).absolute())
 
 
 def _merge(values: Settings, changes: Settings) -> Settings:
