@@ -41,9 +41,7 @@ from splinecli.system.files import check_file, expanded, file_sha256, is_special
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
 LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
-LONGEST = 500_000_000
-"""Largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB."""
-
+LONGEST = 500_000_000  # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
 _LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -91,10 +89,8 @@ def save_weights(network: SplineNet, path: Path) -> None:
 
 def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
     """Write the parameters of a module as float16, with metadata and their checksum. Raises OutputError."""
-    tensors = {
-        name: tensor.detach().cpu().half().clone(memory_format=torch.contiguous_format)
-        for name, tensor in module.state_dict().items()
-    }
+    half = {name: tensor.detach().cpu().half() for name, tensor in module.state_dict().items()}
+    tensors = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()}
     write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
 
 
@@ -262,9 +258,8 @@ _NE_NET_MODULES = {
     "hidden": "dense.0",
     "out": "dense.1",
 }
-_MOST_NAMES = 5
+# Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000.
 _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
-"""Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000."""
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
@@ -358,14 +353,13 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     except Exception as error:  # damaged pickles raise many types of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor) for name, tensor in state.items()
+        isinstance(name, str)
+        and isinstance(tensor, Tensor)
+        and (tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized)
+        for name, tensor in state.items()
     ):
         raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
     return state
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    return tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
 
 
 def _check_content(path: Path) -> None:
@@ -395,5 +389,5 @@ def _check_content(path: Path) -> None:
 
 def _listed(names: Iterable[str]) -> str:
     quoted = [repr(name) for name in names]
-    more = len(quoted) - _MOST_NAMES
-    return ", ".join(quoted[:_MOST_NAMES]) + (f" and {more} more tensors" if more > 0 else "")
+    more = len(quoted) - 5
+    return ", ".join(quoted[:5]) + (f" and {more} more tensors" if more > 0 else "")

@@ -63,8 +63,14 @@ def estimate_light_intensities(
     if intensities is None:
         return None
     normals = _fit(values, known, intensities, light_vectors)
-    if _equal_are_better(intensities, unit(normals), light_vectors):
-        return None
+    if spread_of(unit(normals)) < FLAT_SPREAD:
+        # A flat object may be nearer to its tilt under equal intensities than to the likeliest tilt.
+        directions, shown = _shown(intensities, unit(normals), light_vectors)
+        tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
+        slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
+        tilt_error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
+        if tilt_error < 2 * (1.5 * TILT) ** 2:
+            return None
     predicted = shade(normals, light_vectors)
     error = _error(values / intensities, predicted, known)
     return intensities if error < min(0.35 * equal_error, 0.035) else None  # metals have a larger error
@@ -113,17 +119,6 @@ def _shown(intensities: Float64Array, normals: Float64Array, lights: Float64Arra
     """Return unit directions (F, 3), and the brightness (F,) of a plane with the mean normal under each light."""
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
     return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
-
-
-def _equal_are_better(intensities: Float64Array, normals: Float64Array, lights: Float64Array) -> bool:
-    """Return whether a flat object is nearer to its tilt under equal intensities than to the likeliest tilt."""
-    if spread_of(normals) >= FLAT_SPREAD:
-        return False
-    directions, shown = _shown(intensities, normals, lights)
-    tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
-    slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
-    error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
-    return bool(error < 2 * (1.5 * TILT) ** 2)
 
 
 def _variance(shown: Float64Array, directions: Float64Array, tilt: Float64Array) -> float:

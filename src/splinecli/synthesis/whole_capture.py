@@ -10,18 +10,8 @@ from torch.nn.functional import max_pool2d, pad
 
 from splinecli.restoration.images import restore_saturated
 from splinecli.restoration.lens_blur import remove_blur, surroundings
-from splinecli.synthesis import draw_number
-from splinecli.synthesis.batches import (
-    CaptureConfig,
-    PixelBatch,
-    PixelTruth,
-    add_sensor_noise,
-    disturb_light_directions,
-    disturb_light_intensities,
-    draw_light_intensities,
-    photograph,
-    quantise,
-)
+from splinecli.synthesis import batches, draw_number
+from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.optics import draw_optics
 
@@ -39,7 +29,7 @@ def photograph_captures(
     See `photograph_scene` for the arguments. All pixels of a capture have the same directions, valid ones first.
     """
     if config.capture_pixels == 1:
-        return photograph(truth, radiance, directions, valid, config, generator)
+        return batches.photograph(truth, radiance, directions, valid, config, generator)
     captures = config.captures(len(radiance))
     observations, calibrated = torch.zeros_like(radiance), directions.clone()
     exposure = torch.ones_like(radiance[:, :1])
@@ -86,7 +76,7 @@ def photograph_scene(
     """
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
-    intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
+    intensities = batches.draw_light_intensities(1, lights, config.unequal_lights_share, generator)
     arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
     share = uniform(1e-3, 0.03) if saturated else 1e-3  # of the observations that are clipped, or nearly
@@ -107,7 +97,7 @@ def photograph_scene(
     if config.sensor_noise:
         grain = 10 ** uniform(-2.5, -1.2) * (uniform() < 1 / 3)
         exposed = exposed * (1 + grain * torch.randn(exposed.shape[-3:], generator=generator)).clamp(min=0)
-        exposed = add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
+        exposed = batches.add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
     is_jpeg = False
     if optics is not None:
         exposed, clipped = optics.develop(exposed), clipped.any(dim=0)
@@ -117,9 +107,9 @@ def photograph_scene(
     elif mask is not None:
         exposed, clipped = exposed[wanted], clipped[wanted]
     if config.sensor_noise and not is_jpeg:
-        exposed = quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
+        exposed = batches.quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
-    errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
+    errors = batches.disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
     if uniform() < 0.3 * config.light_intensity_error_share:
         errors = errors * 2 ** (uniform(0, 0.5) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
@@ -128,7 +118,7 @@ def photograph_scene(
         remove_blur(values, mask.numpy(), around.numpy())
         pixels = slice(0, int(mask.sum()))
         observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
-    calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
+    calibrated = batches.disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
     if saturated:
         values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())

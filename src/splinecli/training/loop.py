@@ -21,20 +21,13 @@ from splinecli.synthesis import stream_seed
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.publishing import held_folder
+from splinecli.training import run_files
 from splinecli.training.config import TrainingConfig
 from splinecli.training.config_files import Settings, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
-from splinecli.training.run_files import (
-    Metrics,
-    RunCounters,
-    RunLog,
-    load_checkpoint,
-    none_for_nan,
-    read_checkpoint_config,
-    save_checkpoint,
-)
+from splinecli.training.run_files import Metrics, RunCounters, RunLog
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
 
 
@@ -112,7 +105,7 @@ class Trainer:
         self.counters = RunCounters()
         if resume:
             state = self.network, self.average, self.optimizer
-            self.counters = load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
+            self.counters = run_files.load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
         if self.workers.leads and self.task.long_start:
             say(self.task.long_start)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
@@ -198,7 +191,7 @@ class Trainer:
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
         state = self.network, self.average, self.optimizer, self.counters
-        save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
+        run_files.save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
 
     def _not_finite(self, problem: str) -> ModelError:
         lower = "a lower learning rate, such as --param learning_rate=1e-4"
@@ -219,10 +212,10 @@ class Trainer:
             learning_rate=self.optimizer.param_groups[0]["lr"],
             loss=float(summed.total),
             angle_deg=math.degrees(averaged.angle),
-            map_error=none_for_nan(float(averaged.on_map)),
-            masked_map_error=none_for_nan(float(averaged.masked)),
-            symmetric=none_for_nan(float(summed.symmetric)),
-            asymmetric=none_for_nan(float(summed.asymmetric)),
+            map_error=run_files.none_for_nan(float(averaged.on_map)),
+            masked_map_error=run_files.none_for_nan(float(averaged.masked)),
+            symmetric=run_files.none_for_nan(float(summed.symmetric)),
+            asymmetric=run_files.none_for_nan(float(summed.asymmetric)),
             validation_deg=checked_deg,
         )
 
@@ -237,7 +230,7 @@ def configure_run(
     """
     if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
         return configure(preset_name, file, changes), False
-    started = read_checkpoint_config(folder / CHECKPOINT)
+    started = run_files.read_checkpoint_config(folder / CHECKPOINT)
     asked = configure(preset_name, file, changes, base=started)
     check_resumable(started, asked, folder / CHECKPOINT)
     return asked, True

@@ -107,7 +107,12 @@ class ScenePool:
         mask = torch.from_numpy(np.array(pixels.mask))
         scale = 1 + 2.0 * float(torch.rand((), generator=generator))
         scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
-        box = _draw_box(mask, round(96 / scale), generator)
+        # A part of the map around a random pixel of the object.
+        places, side = mask.nonzero(), round(96 / scale)
+        middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
+        bounds = zip(middle, places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist(), strict=True)
+        starts = [(max(low, min(at - side // 2, high - side)), high) for at, low, high in bounds]
+        box = tuple(slice(start, min(start + side, high)) for start, high in starts)
         kept = torch.zeros_like(mask)
         kept[box] = mask[box]
         rows = kept[mask].numpy()
@@ -162,16 +167,6 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
     weighed = torch.cat((maps * mask, mask[None].float()))
     found = torch.nn.functional.interpolate(weighed[None], scale_factor=scale, mode="bilinear")[0]
     return found[:-1] / found[-1:].clamp(min=0.5), found[-1] > 0.5
-
-
-def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slice, slice]:
-    """Return a part of a map, at most `side` pixels wide and high, around a random pixel of the object."""
-    places = mask.nonzero()
-    middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
-    lowest, highest = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
-    starts = [max(low, min(at - side // 2, high - side)) for at, low, high in zip(middle, lowest, highest, strict=True)]
-    top, left = (slice(start, min(start + side, high)) for start, high in zip(starts, highest, strict=True))
-    return top, left
 
 
 @torch.no_grad()
