@@ -11,7 +11,6 @@ from splinecli.synthesis.scenes import (
     MIN_LIGHT_Z,
     SceneConfig,
     draw_lights,
-    draw_patches,
     draw_scene,
     render_scene,
 )
@@ -66,22 +65,3 @@ def test_lights_cover_the_upper_hemisphere() -> None:
     probes[:, 2] = np.abs(probes[:, 2])
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12
-
-
-def test_patches_are_connected_areas_of_about_one_size() -> None:
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.arange(31), np.arange(31)), axis=-1).reshape(-1, 2) / 15 - 1
-    vertices = np.column_stack((grid, np.zeros(len(grid)))).astype(np.float32)
-    corner = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
-    faces = np.concatenate(
-        (np.stack((corner, corner + 1, corner + 32), 1), np.stack((corner, corner + 32, corner + 31), 1))
-    )
-    mesh = Mesh(vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1)))
-    patches = draw_patches(mesh, 20, rng)
-    assert patches.shape == (1800,) and set(np.unique(patches)) <= set(range(20))
-    centres = vertices[faces].mean(axis=1)
-    for patch in np.unique(patches):
-        here = centres[patches == patch]
-        # Voronoi cells are convex: their middle belongs to them, or to the face next to it.
-        middle = np.linalg.norm(centres - here.mean(axis=0), axis=1).argsort()[:6]
-        assert (patches[middle] == patch).any()

@@ -265,24 +265,12 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
     return made
 
 
-def test_a_weight_file_is_no_checkpoint(trainer: Trainer, tmp_path: Path) -> None:
-    save_weights(trainer.network, tmp_path / CHECKPOINT)
+def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer: Trainer, tmp_path: Path) -> None:
+    path = tmp_path / CHECKPOINT
+    whole = path.read_bytes()
+    save_weights(trainer.network, path)
     with pytest.raises(ModelError, match="found splinecli-weights-1, expected splinecli-checkpoint-2"):
-        read_checkpoint_config(tmp_path / CHECKPOINT)
-
-
-def test_no_changed_byte_goes_unnoticed(trainer: Trainer, tmp_path: Path) -> None:
-    path = tmp_path / CHECKPOINT
-    whole = path.read_bytes()
-    for position in (8, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
-        with pytest.raises(ModelError):
-            read_checkpoint_config(path)
-
-
-def test_settings_of_a_later_splinecli(trainer: Trainer, tmp_path: Path) -> None:
-    path = tmp_path / CHECKPOINT
-    whole = path.read_bytes()
+        read_checkpoint_config(path)
     # The checksum does not cover the header. The new text has the same length, so that the header stays valid.
     assert whole.count(b"batch_size") == 1
     path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
