@@ -10,12 +10,15 @@ import pytest
 from splinecli.errors import ModelError, UsageError
 from splinecli.pipeline.options import parse_light_counts
 from splinecli.training import defaults
-from splinecli.training.config import GENERATOR, PRESETS, TrainingConfig, preset
-from splinecli.training.config_files import (
+from splinecli.training.config import (
+    GENERATOR,
+    PRESETS,
+    TrainingConfig,
     check_resumable,
     configure,
     parse_parameter,
     parse_sources,
+    preset,
     read_config_file,
 )
 

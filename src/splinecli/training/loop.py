@@ -22,8 +22,7 @@ from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.publishing import held_folder
 from splinecli.training import run_files
-from splinecli.training.config import TrainingConfig
-from splinecli.training.config_files import Settings, check_resumable, configure
+from splinecli.training.config import Settings, TrainingConfig, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
