@@ -16,6 +16,7 @@ Their normals are assumed to be in our frame: x right, y up, z to the camera.
 
 import hashlib
 import json
+import os
 import pickletools
 import warnings
 import zipfile
@@ -194,19 +195,13 @@ def untrained_warning(sha256: str, n_lights: int) -> list[str]:
     return []
 
 
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # the name is too long for a file name
-        return False
-
-
 def resolve_weights(name_or_file: str) -> LoadedNetwork:
     """Load shipped weights by name, or a weight file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
         path = expanded(name_or_file)
-        if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
+        # os.path is false for names that are too long for a file, where Path raises.
+        if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
             raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
         return load_weights(path)
@@ -272,7 +267,9 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
     tensors = _flip_rows(_read_li_net(li_net_file, network.li_net), "li_net.")
-    ne_net = _read_ne_net(ne_net_file, network.ne_net)
+    parts = (name.rpartition(".") for name in network.ne_net.state_dict())
+    names = {f"{module}.{kind}": f"{_NE_NET_MODULES[module]}.{kind}" for module, _, kind in parts}
+    ne_net = _rename(ne_net_file, network.ne_net, names, {})
     side = network.config.map_size // 2
     hidden = ne_net["hidden.weight"]
     ne_net["hidden.weight"] = hidden.reshape(len(hidden), -1, side, side).flip(2).flatten(1)
@@ -297,21 +294,12 @@ def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
         if kind == "weight" and tensor.ndim == 1:
             tracked |= {f"{norm}.running_mean": tensor.shape, f"{norm}.running_var": tensor.shape}
             tracked[f"{norm}.num_batches_tracked"] = torch.Size([])
-    return _rename(path, _read_state(path), li_net, names, tracked)
+    return _rename(path, li_net, names, tracked)
 
 
-def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
-    names = {}
-    for name in ne_net.state_dict():
-        module, _, parameter = name.rpartition(".")
-        names[name] = f"{_NE_NET_MODULES[module]}.{parameter}"
-    return _rename(path, _read_state(path), ne_net, names, {})
-
-
-def _rename(
-    path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
-) -> dict[str, Tensor]:
+def _rename(path: Path, network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]) -> dict[str, Tensor]:
     """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists unused shapes."""
+    state = _read_state(path)
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
     missing = [name for name in shapes if name not in state]
