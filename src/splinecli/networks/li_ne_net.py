@@ -192,12 +192,9 @@ class CaptureHead(nn.Module):
             self.linear.bias[1] = -3.5  # initial value of the logarithm of the median error in radians
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
-        """Return the adjusted distributions (P, 2).
+        """Return the adjusted distributions (P, 2) of the errors (P, 2), from features of the pixels (P, 2).
 
-        Args:
-            errors: (P, 2), distributions of the errors.
-            pixels: (P, 2), features of the pixels.
-            capture: (20,) or (P, 20), features of the capture, in the order of CaptureFeatures. NaN means unknown.
+        The features of the capture (20,) or (P, 20) are in the order of CaptureFeatures. NaN means unknown.
         """
         inputs = torch.cat((errors, pixels, capture.expand(len(errors), -1)), dim=1)
         inputs = ((inputs - self.mean) / self.spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
