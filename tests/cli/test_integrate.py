@@ -80,7 +80,7 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
 def test_an_array_of_something_else(run):
     np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
     result = run("integrate", "albedo.npy", "-o", "out")
-    assert (result.code, "these are no normals" in result.err) == (3, True)
+    assert (result.code, "these are not normals" in result.err) == (3, True)
 
 
 @pytest.mark.parametrize("where", ["mask", "alpha"])
@@ -93,7 +93,7 @@ def test_a_background_that_is_not_black(run, where):
     arguments = ["integrate", "white.png", "-o", "out", "--format", "npy"]
     if where == "mask":
         refused = run(*arguments)
-        assert (refused.code, "these are no normals" in refused.err) == (3, True)
+        assert (refused.code, "these are not normals" in refused.err) == (3, True)
         arguments += ["--mask", "mask.png"]
     assert run(*arguments).code == 0
     check_heights(np.load("out/depth.npy"))

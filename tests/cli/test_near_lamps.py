@@ -89,7 +89,7 @@ REFUSED = [
     ("--pixel-size 1", 2, "--pixel-size concerns near lamps, and bump has no light_positions.txt"),
     ("--light-positions l.txt --lights l.txt", 2, "contradict each other"),
     ("--light-positions missing.txt", 3, "missing.txt: the file does not exist"),
-    ("--light-positions l.txt", 3, "nothing tells the scale of the lamps' positions"),
+    ("--light-positions l.txt", 3, "the scale of the lamp positions is unknown"),
     ("--light-positions l.txt --pixel-size 1 --light-format azel", 2, "concerns light directions"),
 ]
 

@@ -253,7 +253,7 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     assert [len(lights) for lights in fake.lights] == [5, 8]
     np.testing.assert_array_equal(fake.observations[0], read_capture(folders[0]).observations[:, 3:])
     assert [result.n_lights for result in evaluation.results] == [5, 8]
-    assert evaluation.notes == ("bearPNG: the first 3 images are left out.",)
+    assert evaluation.notes == ("bearPNG: the first 3 images were left out.",)
     every = Fake(folders[0])
     evaluate(folders, [every], Protocol(skip_first={"*": 4, "other": 1}))
     assert [len(lights) for lights in every.lights] == [4, 7]

@@ -97,7 +97,7 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         return []
     kinds, used = (", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images))
     text = f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the same photographs, and"
-    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} are left out.")]
+    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:

@@ -226,9 +226,9 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
-        hint = "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
-        hint += (
-            " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly"
+        hint = (
+            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from images"
+            " of a mirror ball. Without one, --lights estimate finds them from the images, with lower accuracy"
         )
         problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
         raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)

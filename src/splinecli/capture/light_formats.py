@@ -111,7 +111,7 @@ def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
         raise InputError(f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path)
     vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" has not x, y and z for each light', path=path)
+        raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
     adjusted = len(factors) == len(vectors) and min(map(min, factors)) > 0
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors if adjusted])
 

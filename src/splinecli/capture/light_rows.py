@@ -87,7 +87,7 @@ def parse_light_frame(text: str | None) -> LightFrame:
             raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
-            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} comes twice", hint="Leave one out")
+            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} is listed twice", hint="Leave one out")
         signs[axis] = sign
     return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
 

@@ -173,7 +173,11 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
         return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
     # A position in metres instead of millimetres changes the distance a thousandfold.
     if distances[nearest] > 300.0 * max(sizes):
-        return [CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")]
+        return [
+            CaptureWarning(
+                LAMP_DISTANCE, f"The lamps are so far away that their light is parallel: {text}. {UNIT_HINT}."
+            )
+        ]
     return []
 
 
@@ -335,7 +339,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
         hint = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
-        raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=hint)
+        raise InputError("the scale of the lamp positions is unknown", path=positions, hint=hint)
     return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
 
 

@@ -182,7 +182,7 @@ def _read_lights(
         return _drop_bad_lights(files, lights, None, warnings)
     images, how = lights.match(files.images)
     if len(images) < len(files.images):
-        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
+        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others were left out."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."

@@ -115,7 +115,7 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     draw = tuple(map(int, words))
     for position, index in enumerate(draw):
         if index in draw[:position]:
-            raise InputError(f"light index {index} comes twice", path=path, line=line, hint="Name each light once")
+            raise InputError(f"light index {index} is listed twice", path=path, line=line, hint="Name each light once")
     if len(draw) < MIN_LIGHTS:
         raise InputError(f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line)
     if len(draw) != n_lights:

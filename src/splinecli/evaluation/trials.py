@@ -281,7 +281,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
     if skipped:
-        notes.append(f"{name}: the first {skipped} images are left out.")
+        notes.append(f"{name}: the first {skipped} images were left out.")
     elif damaged:
         notes.append(
             f"{name}: the first {damaged} images are known to be damaged and are used;"

@@ -242,7 +242,7 @@ class Distributor:
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
                 hint = "If there is too little memory, use fewer. Dask's output says more"
-                raise SplinecliError("the workers end while they are getting ready", hint=hint)
+                raise SplinecliError("the workers stop while they start", hint=hint)
             while following is not None and len(self.running) < len(workers):
                 limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
                 largest = max(float(limit or math.inf) for limit in limits)
@@ -315,7 +315,7 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
 
 
 def _scheduler_lost() -> SplinecliError:
-    hint = "Run the same command again. It skips what is done"
+    hint = "Run the same command again. It skips captures that are already done"
     return SplinecliError("the connection to the Dask scheduler was lost", hint=hint)
 
 

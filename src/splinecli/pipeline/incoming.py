@@ -43,7 +43,7 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            problem = f"contains {others[0]}, which is no frame of this film"
+            problem = f"contains {others[0]}, which is not a frame of this film"
             raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
         whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
         if of_film == stamp and whole and redo != "all":

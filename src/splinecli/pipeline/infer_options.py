@@ -104,7 +104,7 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.address is not None and self.workers != 1:
-            hint = "Leave --workers out: the cluster has its workers"
+            hint = "Leave --workers out: the cluster has workers of its own"
             raise UsageError("--workers and --cluster contradict each other", hint=hint)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
@@ -138,7 +138,7 @@ class Reading(Record, frozen=True, kw_only=True):
     ground_truth: Annotated[FileName | None, Option("Input", "FILE",
         "True normals to compare with (.mat, .npy, text, PNG, TIFF).")] = None
     transfer: Annotated[str, Option("Input", "CURVE",
-        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads files as they say; JPEG as sRGB.",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files, and reads JPEG as sRGB.",
         complete=CURVES)] = AUTOMATIC
     ambient: Annotated[FileName | None, Option("Input", "FILE",
         "Image taken without the lights, to subtract from all images.", default="ambient.*")] = None
@@ -175,7 +175,7 @@ class Reading(Record, frozen=True, kw_only=True):
         "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is then estimated in the"
         " frame of its viewing ray.", default="camera_matrix.txt in CAPTURE, or orthographic")] = None
     strict: Annotated[bool, Option("Output", "",
-        "Fail (exit code 3) where a warning says that the lights or the images are probably wrong.")] = False
+        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.")] = False
     surface = False  # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
 
     def __post_init__(self) -> None:

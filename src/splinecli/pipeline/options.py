@@ -226,7 +226,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
 
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
-            hint = "Without it, the captures' light files count"
+            hint = "Without it, the light files of the captures are used"
             raise UsageError(f"--lights is {self.lights}; expected {ESTIMATE}", hint=hint)
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
             problem = "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg"

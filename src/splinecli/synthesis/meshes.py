@@ -98,7 +98,7 @@ def _read_known(path: Path) -> tuple[str, bytes]:
     elif b"\0" not in content and re.search(rb"^[ \t]*v\s", content, re.MULTILINE):
         kind = "obj"
     else:
-        raise ValueError("it has none of these formats")
+        raise ValueError("it is in none of these formats")
     if len(content) > (most := _LONGEST[kind]):
         raise InputError(f"found a longer file than {most / 1e6:.0f} MB", path=path, hint="Decimate the mesh")
     return kind, content

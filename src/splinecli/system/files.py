@@ -153,7 +153,7 @@ def is_special(path: Path) -> bool:
 def read_json(path: Path) -> Any:
     """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it is not a file."""
     if is_special(path):
-        raise ValueError("it is no file")
+        raise ValueError("it is not a file")
     if path.stat().st_size > _MOST_JSON:
         raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
     return parse_json(path.read_text("utf-8"))

@@ -142,7 +142,7 @@ def _lines_until(step: int, path: Path) -> list[str]:
     if not path.exists():
         return []
     if not path.is_file() or path.stat().st_size > 1 << 26:  # about half a million lines
-        raise ValueError("it is no such file")
+        raise ValueError("it is not a checkpoint")
     header, *lines = path.read_text("utf-8").splitlines()
     if header != _HEADER:
         raise ValueError("another version wrote it")

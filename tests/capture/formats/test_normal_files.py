@@ -135,7 +135,7 @@ def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArra
 def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(tmp_path, write_image, normals):
     for bits in (8, 16):
         picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
-        with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"):
+        with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are not normals"):
             read_normal_map(write_image("photograph.png", picture))
     damaged = normals.astype(np.float32)
     damaged[3, 4] = 1e30

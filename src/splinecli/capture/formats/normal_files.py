@@ -171,7 +171,7 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     if share < 0.6:
         problem = f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected"
         hint = "If the background is not black, give a mask"
-        raise InputError(f"{problem} nearly all: these are no normals", path=path, hint=hint)
+        raise InputError(f"{problem} nearly all: these are not normals", path=path, hint=hint)
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
