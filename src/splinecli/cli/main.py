@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from splinecli import __version__
 from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
@@ -122,8 +122,19 @@ def _expand(value: Any) -> Any:
     return value
 
 
+class Commands(TyperGroup):
+    """The command splinecli itself."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, without the Python types of flags."""
+        for option in self.get_params(ctx):
+            option.metavar = ""
+        super().format_help(ctx, formatter)
+
+
 app = typer.Typer(
     name="splinecli",
+    cls=Commands,
     help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
     rich_markup_mode="rich",
