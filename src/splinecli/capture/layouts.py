@@ -227,9 +227,10 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
-        hint += " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly"
+        hint += " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less"
+        hint = f"Add {option}" if option else f"{hint} exactly"
         problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
-        raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)
+        raise InputError(problem, path=folder, hint=hint)
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
