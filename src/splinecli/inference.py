@@ -11,7 +11,6 @@ are processed in tiles, so that only the results grow with the capture.
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -37,7 +36,7 @@ from splinecli.methods.estimator import TILE_PIXELS, confidence
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Clock, Progress
 
 PIXELS_ON_THE_WAY = 40_000  # larger captures are fitted at about this size: fine detail hardly moves the surface
 
@@ -65,9 +64,6 @@ def find_surface(capture: Capture) -> Capture:
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
     points = lighting.surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
     return replace(capture, lamps=replace(lamps, points=points))
-
-
-Stage = Callable[[str], AbstractContextManager[Progress]]
 
 
 @dataclass(frozen=True)
@@ -104,17 +100,17 @@ def estimate_normals(
     estimator: Estimator,
     *,
     progress: Progress | None = None,
-    stage: Stage | None = None,
+    clock: Clock | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
     The capture of the result has the points of this surface. `progress` is called with the number of pixels just
-    finished, after each batch of the estimator, and `stage` with the name of each later stage when it begins; its
-    function is called like `progress`. Raises SplinecliError if the normals are not unit vectors.
+    finished, after each batch of the estimator. The clock times the stages that follow, and shows them. Raises
+    SplinecliError if the normals are not unit vectors.
     """
     started = time.perf_counter()
     capture = find_surface(capture)
-    normals, errors, judged = _estimate(capture, estimator, progress, stage)
+    normals, errors, judged = _estimate(capture, estimator, progress, clock or Clock())
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
@@ -133,18 +129,18 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture, estimator: Estimator, progress: Progress | None, stage: Stage | None
+    capture: Capture, estimator: Estimator, progress: Progress | None, clock: Clock
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
     Methods without confidence have no distributions.
     """
-    found = estimate_pixels(capture.mask, capture.observations, lighting_on(capture), estimator, progress, stage)
+    found = estimate_pixels(capture.mask, capture.observations, lighting_on(capture), estimator, progress, clock)
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner
     if refiner is not None and errors is not None:
-        with (stage or _no_stage)("refining") as advance:
-            refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
+        advance = clock.begin("refine", capture.n_pixels, "refining")
+        refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
     judged = errors is not None and correct_errors(capture, estimator, found.lighting_at, normals, errors)
     if errors is not None:
         found_lights = [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
@@ -173,7 +169,7 @@ def estimate_pixels(
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
     progress: Progress | None = None,
-    stage: Stage | None = None,
+    clock: Clock | None = None,
 ) -> PixelEstimates:
     """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
 
@@ -183,9 +179,9 @@ def estimate_pixels(
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
         lighting_without: gives the light of some pixels without the given indirect light; None removes nothing.
-        progress, stage: see estimate_normals.
+        progress, clock: see estimate_normals.
     """
-    n_pixels = len(observations)
+    clock, n_pixels = clock or Clock(), len(observations)
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
@@ -202,22 +198,18 @@ def estimate_pixels(
         estimate(pixels, lighting_at(pixels), progress)
     if refiner is None or errors is None:
         return PixelEstimates(normals, errors, lighting_at)
-    with (stage or _no_stage)("removing indirect light") as advance:
-        indirect = lighting.find_indirect_light(mask, observations, lighting_at, normals)
-        if indirect is not None:
-            lighting_at = partial(lighting_without, indirect)
-            # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
-            estimator = estimator.rebind(lighting_at, n_pixels)
-            for pixels in parts_of_pixels(n_pixels, tile_pixels):
-                changed = pixels[indirect.counts_at(observations[pixels], pixels)]
-                if len(changed):
-                    estimate(changed, lighting_at(changed))
-                advance(len(pixels))
+    advance = clock.begin("indirect_light", n_pixels, "removing indirect light")
+    indirect = lighting.find_indirect_light(mask, observations, lighting_at, normals)
+    if indirect is not None:
+        lighting_at = partial(lighting_without, indirect)
+        # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
+        estimator = estimator.rebind(lighting_at, n_pixels)
+        for pixels in parts_of_pixels(n_pixels, tile_pixels):
+            changed = pixels[indirect.counts_at(observations[pixels], pixels)]
+            if len(changed):
+                estimate(changed, lighting_at(changed))
+            advance(len(pixels))
     return PixelEstimates(normals, errors, lighting_at)
-
-
-def _no_stage(_: str) -> AbstractContextManager[Progress]:
-    return nullcontext(lambda _: None)
 
 
 def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndices], PixelLighting]:

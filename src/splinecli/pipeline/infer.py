@@ -6,7 +6,7 @@ Both `infer` and splinecli.estimate_normals use this code. A distilled estimator
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -32,6 +32,7 @@ from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
 from splinecli.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import make_surface, view_of_report
 from splinecli.results import files
@@ -41,7 +42,7 @@ from splinecli.results.pages import result_page
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
-from splinecli.system.progress import SILENT, Advance, Clock, Observer
+from splinecli.system.progress import SILENT, Clock, Observer
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 if TYPE_CHECKING:
@@ -82,13 +83,8 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
     return float(n_bytes)
 
 
-# Pixels from which a capture is distilled by default; not timed at run time, because the machine's load must not change
-# the normals. From this size on, distillation takes less than half of the network's time on 1 to 16 cores and an H100.
-AUTOMATIC_FROM = 100_000
-
-
 def distil_for(
-    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
+    capture: Capture, estimator: Estimator, wanted: bool | None, clock: Clock | None = None
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
@@ -101,6 +97,7 @@ def distil_for(
             raise UsageError(problem, hint="Leave --distil out")
         return None, []
 
+    clock = clock or Clock()
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not estimator.has_confidence:
@@ -114,8 +111,8 @@ def distil_for(
 
     for size in sizes:
         try:
-            with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
+            advance = clock.begin("distil", 2 * size.sample, "learning the capture")
+            distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
             return refuse(f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
@@ -128,9 +125,6 @@ def distil_for(
     return None, [CaptureWarning(NOT_DISTILLED, text)]
 
 
-_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # the clock's names
-
-
 def estimate_capture(
     capture: Capture,
     estimator: Estimator,
@@ -139,7 +133,6 @@ def estimate_capture(
     refine_lights: Callable[[Capture], Capture] | None = None,
     distil: bool | None = None,
     strict: bool = False,
-    observer: Observer = SILENT,
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
@@ -147,11 +140,11 @@ def estimate_capture(
 
     The capture already contains the warnings from reading it. `check` returns the warnings about its lights and images
     (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
-    is called with the number of pixels just estimated, instead of the observer. With `strict`, a warning that an input
-    is probably wrong becomes an InputError. The stages are reported to the observer and timed by the clock.
+    is called with the number of pixels just estimated. With `strict`, a warning that an input is probably wrong becomes
+    an InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
-    clock.begin("check")
+    clock.begin("check", note="checking")
     warnings = [*capture.warnings, *check(capture)]
     refuse_if_strict(warnings, capture.name, strict=strict)
     if refine_lights is not None:
@@ -160,19 +153,10 @@ def estimate_capture(
         warnings = [warning for warning in warnings if warning.kind != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
     capture = replace(capture, warnings=tuple(warnings))
-    clock.begin("estimate")
     capture = find_surface(capture)
-    clock.begin("distil")
-    distilled, found = distil_for(capture, estimator, distil, observer)
-    with ExitStack() as stages:
-
-        def stage(name: str) -> AbstractContextManager[Advance]:
-            stages.close()  # show only one progress bar at a time
-            clock.begin(_STAGES.get(name, "estimate"))
-            return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
-
-        advance = stages.enter_context(stage("estimating"))
-        estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
+    distilled, found = distil_for(capture, estimator, distil, clock)
+    advance = clock.begin("estimate", capture.n_pixels, "estimating")
+    estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, clock=clock)
     warnings += found
     warnings += [CaptureWarning(UNTRAINED_LIGHTS, text) for text in estimator.warn_of_lights(capture.n_lights)]
     # The other warnings explain why the confidence is low.
@@ -199,12 +183,13 @@ def infer_capture(
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
-    with held_results(capture_name(folder), options, observer) as target:
-        clock = Clock()
+    name = capture_name(folder)
+    with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
+        clock = Clock(show)
         if options.finds_lights:
             _check_light_files(target)
-        source, capture = _read(folder, options, observer)
         estimator = estimator or make_method(options)
+        source, capture = _read(folder, options, estimator.has_confidence, clock)
         _check_results(capture, folder, options)
         refine = partial(refine_capture, intensities_known=source.intensities_known)
         estimate, distilled = estimate_capture(
@@ -214,7 +199,6 @@ def infer_capture(
             refine_lights=refine if options.refine_lights else None,
             distil=options.distil,
             strict=options.strict,
-            observer=observer,
             clock=clock,
         )
         for warning in estimate.capture.warnings:
@@ -230,8 +214,8 @@ def infer_capture(
         )
         if source.light_numbers is not None:
             report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
-        found = _make_files(source, estimate, report, options, observer, clock)
-        clock.begin("write")
+        found = _make_files(source, estimate, report, options, clock)
+        clock.begin("write", note="writing")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
 
 
@@ -268,18 +252,22 @@ def make_method(options: InferOptions) -> Estimator:
     return estimator
 
 
-def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture]:
+def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> tuple[CaptureSource, Capture]:
     source = options.open(folder)
-    name = source.files.name
-    if options.auto_mask:
-        with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
-            source = source.find_mask(lambda: advance(1))
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
-    with observer.progress(f"{name}: reading", count) as advance:
-        capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
+    height, width, *_ = source.facts[0].size[0]
+    seconds = partial(expected_seconds, n_images=count, image_pixels=height * width, network=network)
+    clock.expect(seconds(height * width, distils=options.distil))
+    if options.auto_mask:
+        advance = clock.begin("read", 2 * source.n_lights, "finding the object")
+        source = source.find_mask(lambda: advance(1))
+    advance = clock.begin("read", count, "reading")
+    capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
+    rest = seconds(capture.n_pixels, distils=options.distil)
+    clock.expect({stage: rest[stage] for stage in rest if stage != "read"})
     return source, capture
 
 
@@ -310,19 +298,18 @@ def _make_files(
     estimate: NormalEstimate,
     report: dict[str, Any],
     options: InferOptions,
-    observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
     """Compute the results that the options request, add the surface to the report, and return the files."""
     capture = estimate.capture
-    clock.begin("pictures")
+    clock.begin("pictures", note="maps")
     made: dict[str, NDArray[np.float32]] = {}
     for row in chosen_maps(options.maps, page=options.html):
         if not (row.bytes_per_pixel or (options.html and row.caption)):
             continue  # computed when it is written
         if row.reads_images:
-            with observer.progress(f"{capture.name}: {row.name}", capture.n_lights) as advance:
-                values = make_map(row, source, estimate, lambda: advance(1))
+            count = partial(clock.begin("pictures", capture.n_lights, row.name), 1)
+            values = make_map(row, source, estimate, count)
         else:
             values = make_map(row, source, estimate)
         if values is not None:
@@ -346,19 +333,18 @@ def _make_files(
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
-        clock.begin("surface")
+        advance = clock.begin("surface", note="integrating")
         camera_matrix, pixel_size = view_of_report(report)
         colours = map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
-        with observer.progress(f"{capture.name}: integrating", 1) as advance:
-            surface, report["surface"] = make_surface(
-                estimate.normal_map,
-                capture.mask,
-                camera_matrix,
-                colours,
-                discontinuity=options.discontinuity,
-                pixel_size_mm=pixel_size,
-                progress=advance,
-            )
+        surface, report["surface"] = make_surface(
+            estimate.normal_map,
+            capture.mask,
+            camera_matrix,
+            colours,
+            discontinuity=options.discontinuity,
+            pixel_size_mm=pixel_size,
+            progress=advance,
+        )
         formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
         found.append(encode_surface(surface, formats))
     if options.html:

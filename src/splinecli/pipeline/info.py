@@ -17,17 +17,13 @@ from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.estimator import student_sizes
 from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, infer_bytes
+from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
 from splinecli.pipeline.infer_options import InfoOptions, Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
-
-# Pixels per second of spline-net on a laptop's processor, and with distillation of reading, network, refinement and
-# writing together, on two cores. benchmarks/inference_speed.py measures the speed of your machine.
-PIXELS_PER_SECOND, DISTILLED_PER_SECOND = 2000, 130_000
 
 # The sources of a white level, as human-readable text.
 ORIGINS = {
@@ -190,7 +186,9 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
-    first, seconds = summary.images[0], 3 + _seconds(summary)
+    first = summary.images[0]
+    stages = expected_seconds(summary.n_pixels, len(summary.images), first.shape[0] * first.shape[1])
+    seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
 
@@ -237,12 +235,3 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
             "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
-
-
-def _seconds(summary: CaptureSummary) -> float:
-    """Return the runtime of spline-net on a capture, with distillation if `infer` would use it at this size."""
-    count = summary.n_pixels
-    if count < AUTOMATIC_FROM:
-        return count / PIXELS_PER_SECOND
-    # Estimation on the sample and training on it together process 1000 pixels per second.
-    return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND
