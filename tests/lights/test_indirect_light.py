@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from scenes import directions_at
-from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.inference import estimate_normals
+from splinecli.lights import lighting
 from splinecli.lights.lighting import IndirectLight, PixelLighting, find_indirect_light
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
@@ -141,7 +141,7 @@ def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
         return float(angle_between_deg(found, BOWL).mean())
 
     without = mean_error_deg()
-    with patch.object(inference, "find_indirect_light", return_value=None):
+    with patch.object(lighting, "find_indirect_light", return_value=None):
         assert without < 0.6 * mean_error_deg()
 
 
