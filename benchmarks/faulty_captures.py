@@ -33,7 +33,7 @@ from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import draw_patches
 from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn
-from splinecli.synthesis.whole_capture import photograph_images
+from splinecli.synthesis.whole_capture import photograph_scene
 
 Floats = NDArray[np.floating]
 
@@ -186,7 +186,9 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
         )  # fmt: skip
         images = torch.zeros(len(lights), *mask.shape)
         images[:, torch.from_numpy(mask)] = radiance.float().T
-        seen, *_ = photograph_images(images, torch.from_numpy(mask), torch.from_numpy(single), config, generator)
+        seen, *_ = photograph_scene(
+            images.flatten(1).T, torch.from_numpy(single), config, generator, torch.from_numpy(mask)
+        )
         observations = np.asarray(seen.numpy(), np.float32)
         stated = lights
         if kind == "curve":

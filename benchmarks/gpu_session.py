@@ -138,7 +138,7 @@ def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, sa
     from splinecli.system.devices import choose_device
 
     from splinecli.training import tasks
-    from splinecli.training.config_files import configure
+    from splinecli.training.config import configure
     from splinecli.training.loop import Trainer
 
     tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1
@@ -187,7 +187,7 @@ def finish_set(folder: str) -> Row:
 def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: float) -> Row:
     """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of it at most."""
     from splinecli.training import tasks
-    from splinecli.training.config_files import configure
+    from splinecli.training.config import configure
     from splinecli.training.loop import open_run
 
     def minutes_left() -> float:

@@ -21,11 +21,10 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.networks.light_net import LightNet, network_inputs, square_images
 from splinecli.networks.weights import LIGHT_FORMAT, save_module
-from splinecli.synthesis import shapes
+from splinecli.synthesis import draw_number, shapes
 from splinecli.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.synthesis.meshes import Mesh, ellipsoid, fit_to_frame, smooth_union, triangulate
 from splinecli.synthesis.principled import CLASSES
-from splinecli.synthesis.random_numbers import draw_number
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.synthesis.whole_capture import add_background
 

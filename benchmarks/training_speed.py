@@ -17,8 +17,7 @@ from typing import Any
 import torch
 
 from splinecli.system.machine import choose_device
-from splinecli.training.config import PRESETS
-from splinecli.training.config_files import configure
+from splinecli.training.config import PRESETS, configure
 from splinecli.training.loop import Trainer
 from splinecli.training.tasks import PixelTask
 

@@ -18,7 +18,6 @@ from scenes import cap_directions, directions_at, shade, spiral_lights
 from splinecli.system.progress import STAGES
 
 __all__ = ["browser", "directions_at", "open_page"]
-
 GOLDEN = Path(__file__).resolve().parent / "golden"
 
 

@@ -1,11 +1,12 @@
-"""Kill a process at a chosen step of its changes to files, as a power cut or `kill -9` would."""
+"""Kill a process at a chosen step of its changes to files, and check that what it renames is on the disk before."""
 
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
 """Audit events of Python before a change of files. Opening a file for writing is one, too."""
@@ -58,3 +59,57 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
 def content(folder: Path) -> dict[str, bytes]:
     """The content of every file below a folder by its path, hidden ones included."""
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+Call = tuple[str, Path, Path]  # "sync", "rename" or "remove"; the path, and for "rename" the new one
+
+
+def record_calls(work: Callable[[], object]) -> list[Call]:
+    """Do the work and return its calls of the system that sync, rename and remove, in their order."""
+    calls: list[Call] = []
+    fsync = os.fsync
+
+    def sync(handle: int) -> None:
+        fsync(handle)
+        path = Path(f"/proc/self/fd/{handle}").readlink()
+        calls.append(("sync", path, path))
+
+    def follow(kind: str, change: Callable[..., object]) -> Callable[..., object]:
+        def changed(path: str, *more: str, **options: object) -> object:
+            done = change(path, *more, **options)
+            calls.append((kind, Path(path).absolute(), Path(more[0] if more else path).absolute()))
+            return done
+
+        return changed
+
+    kinds = {"rename": "rename", "replace": "rename", "unlink": "remove", "remove": "remove"}
+    changes = {name: follow(kind, getattr(os, name)) for name, kind in kinds.items()}
+    with patch.multiple(os, fsync=sync, **changes):
+        work()
+    return calls
+
+
+def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
+    """Yield what was changed too early, and the folders whose names may not be on the disk at the end.
+
+    A kill does not lose what was written and not synced, but a power cut does. So a file must be synced before it is
+    renamed. The removal of a report must be on the disk before any file gets its place, and the names of all these
+    files before the report gets its own. Hidden files are no results.
+    """
+    if not any(kind == "rename" for kind, _, _ in calls):
+        yield "nothing is renamed"
+    synced: set[Path] = set()
+    changed: dict[Path, Path] = {}  # folders with a name that is not synced: that name
+    for kind, path, place in calls:
+        if kind == "sync":
+            synced.add(path)
+            changed.pop(path, None)
+        elif not place.name.startswith("."):
+            if kind == "rename" and path not in synced:
+                yield f"{place.name} is renamed before its content is on the disk"
+            unsynced = changed.values() if place.name == report else [n for n in changed.values() if n.name == report]
+            for name in unsynced:
+                yield f"{place.name} changes before {name.name} is on the disk"
+            changed[place.parent] = place
+    for name in changed.values():
+        yield f"the new name {name.name} is not on the disk"

@@ -35,11 +35,7 @@ def make_set(tmp_path: Path) -> MakeSet:
 
     def make(
         name: str = "set",
-        entries: Sequence[tuple[str, str, int, int]] = (
-            ("a", "one", 40, 30),
-            ("b", "two", 30, 25),
-            ("c", "three", 20, 12),
-        ),
+        entries: Sequence[tuple[str, str, int, int]] = THREE_SCENES,
         dtype: DTypeLike = np.float32,
     ) -> PixelSet:
         writer = PixelSetWriter(tmp_path / name)

@@ -5,7 +5,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from splinecli.networks.weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
-
 Run = Callable[..., str]
 
 
@@ -29,9 +28,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the benchmark of this name and return what it prints."""
 
     def run_benchmark(name: str, *arguments: str) -> str:
-        module = importlib.import_module(name)
-        main: Callable[[Sequence[str]], None] = module.main
-        main(arguments)
+        importlib.import_module(name).main(arguments)
         return capsys.readouterr().out
 
     return run_benchmark
@@ -48,20 +45,19 @@ def numbers(line: str) -> list[float]:
     return [float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))]
 
 
-def test_training_speed(run: Run) -> None:
-    """It crashed: CNN-PS has no LI-Net, so its updates cannot alternate."""
-    arguments = ("--batch-size", "4", "--steps", "1", "--warm-up", "1", "--device", "cpu")
-    printed = run("training_speed", *arguments).splitlines()
-    rows = [line.split("  ")[0] for line in printed[1:]]
-    assert rows == ["compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps"]
-    assert all(min(numbers(line[25:])) > 0 for line in printed[1:])
+SPEEDS = {
+    "training_speed --batch-size 4 --steps 1 --warm-up 1 --device cpu": (
+        "compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps",
+    ),
+    "inference_speed --pixels 64 --repeats 1": ("layers of the paper", "spline-net-pixelwise", "spline-net-pixelwise"),
+}  # fmt: skip
 
 
-def test_inference_speed(run: Run) -> None:
-    printed = run("inference_speed", "--pixels", "64", "--repeats", "1").splitlines()
-    names = [line.split(",")[0] for line in printed[1:]]
-    assert names == ["layers of the paper", "spline-net-pixelwise", "spline-net-pixelwise"]
-    assert min(numbers(line)[0] for line in printed[1:]) > 0
+@pytest.mark.parametrize("command", SPEEDS)
+def test_speeds(run: Run, command: str) -> None:
+    printed = run(*command.split()).splitlines()[1:]
+    assert all(line.startswith(name) for line, name in zip(printed, SPEEDS[command], strict=True))
+    assert all(min(numbers(line[25:])) > 0 for line in printed)
 
 
 def test_photographs(run: Run) -> None:
@@ -136,11 +132,8 @@ def test_gpu_session(tmp_path: Path) -> None:
     assert session.step("late", module.normals_apart, one, other, seconds=60) is None
     report = (tmp_path / "report.txt").read_text()
     assert report.count("FAILED") >= 2 and "FileNotFoundError" in report and "there is no time left" in report
-    assert [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())] == [
-        "apart",
-        "missing",
-        "late",
-    ]
+    steps = [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())]
+    assert steps == ["apart", "missing", "late"]
 
 
 def test_all_figures(run: Run, tmp_path: Path) -> None:

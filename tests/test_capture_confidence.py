@@ -19,7 +19,6 @@ from splinecli.networks.li_ne_net import CAPTURE_FEATURES, PIXEL_FEATURES, Captu
 from splinecli.networks.weights import capture_head, manifest
 
 Float64Array = NDArray[np.float64]
-
 SIZE = 40
 WIDTH = float(SIZE)
 

@@ -40,7 +40,9 @@ def test_normals_stand_where_their_pixels_are() -> None:
 def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
     whole = estimate_normals(capture(), LeastSquares())
     done: list[int] = []
-    tiled = estimate_normals(capture(), LeastSquares(), tile_pixels=tile_pixels, progress=done.append)
+    estimator = LeastSquares()
+    estimator.tile_pixels = tile_pixels
+    tiled = estimate_normals(capture(), estimator, progress=done.append)
     # Matrix products of other heights may add up in another order.
     np.testing.assert_allclose(tiled.normal_map, whole.normal_map, atol=1e-6)
     n_pixels = capture().n_pixels

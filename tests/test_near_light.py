@@ -178,11 +178,15 @@ def test_a_camera_far_away_is_orthographic() -> None:
     np.testing.assert_allclose(*maps, atol=2e-3)
 
 
-def test_the_python_door_takes_a_camera() -> None:
-    capture = glossy_sphere(20, side=16)
+def images_of(capture: Capture) -> NDArray[np.float32]:
     images = np.zeros((10, *capture.mask.shape), np.float32)
     images[:, capture.mask] = capture.observations.T
-    arguments = images, LIGHTS, capture.mask
+    return images
+
+
+def test_the_python_door_takes_a_camera() -> None:
+    capture = glossy_sphere(20, side=16)
+    arguments = images_of(capture), LIGHTS, capture.mask
     found = splinecli.estimate_normals(*arguments, camera_matrix=capture.camera_matrix, method="st14")
     expected = estimate_normals(capture, make_estimator("st14")).normal_map
     np.testing.assert_allclose(found.normal_map, expected, atol=1e-5)
@@ -217,8 +221,7 @@ def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPa
 
 def test_the_python_door_takes_positions() -> None:
     capture = near("dome", 4.0)
-    images = np.zeros((10, SIDE, SIDE), np.float32)
-    images[:, capture.mask] = capture.observations.T
-    estimate = splinecli.estimate_normals(images, LIGHTS * 4.0, capture.mask, pixel_size=2 / SIDE, method="iw12")
+    arguments = images_of(capture), LIGHTS * 4.0, capture.mask
+    estimate = splinecli.estimate_normals(*arguments, pixel_size=2 / SIDE, method="iw12")
     expected = estimate_normals(capture, make_estimator("iw12"))
     np.testing.assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
 
 __version__ = "0.3.0"
-
 __all__ = ["__version__", "estimate_normals", "integrate_normals"]
 
 # Everything else is imported inside the functions, because PyTorch takes a second or more to load.

@@ -53,225 +53,122 @@ class CaptureWarning:
         return self.text
 
 
+# The rows form a table: code, meaning, remedy, severity.
+# fmt: off
 AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` of the folder was subtracted")
-BLACK_PIXELS = WarningKind(
-    "black_pixels", "Over 1 % of the pixels are black under every light", "Use a mask, or expose longer"
-)
-CONSTANT_LIGHT = WarningKind(
-    "constant_light",
+BLACK_PIXELS = WarningKind("black_pixels", "Over 1 % of the pixels are black under every light",
+    "Use a mask, or expose longer")
+CONSTANT_LIGHT = WarningKind("constant_light",
     "The images look as if they contained [ambient light](input-checks.md#other-interpretations-of-the-images) or a "
-    "black level",
-    "`--ambient IMAGE`, taken with all lamps off",
-    severity="error",
-)
+    "black level", "`--ambient IMAGE`, taken with all lamps off", severity="error")
 DARK_IMAGES = WarningKind("dark_images", "Images use little of the range", "Expose longer")
 DIFFERENT_SIZES = WarningKind("different_sizes", "The images have different sizes", "Export them in one size")
-DISPLAY_DECODED = WarningKind(
-    "display_decoded",
-    "The images state a curve, as JPEG does, and are read with it",
-    "`--transfer linear` if they are linear",
-)
-DISPLAY_ENCODED = WarningKind(
-    "display_encoded",
-    "Some images are JPEG or sRGB files, but are read as linear",
-    "`--transfer srgb`; none if they are linear",
-)
-EIGHT_BIT = WarningKind(
-    "eight_bit",
-    "The images have 8 bits",
-    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut",
-)
-ESTIMATED_COLOURS = WarningKind(
-    "estimated_colours",
+DISPLAY_DECODED = WarningKind("display_decoded", "The images state a curve, as JPEG does, and are read with it",
+    "`--transfer linear` if they are linear")
+DISPLAY_ENCODED = WarningKind("display_encoded", "Some images are JPEG or sRGB files, but are read as linear",
+    "`--transfer srgb`; none if they are linear")
+EIGHT_BIT = WarningKind("eight_bit", "The images have 8 bits",
+    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut")
+ESTIMATED_COLOURS = WarningKind("estimated_colours",
     "The lamps have different colours, which were estimated and divided out",
-    "RGB intensities with `--intensities FILE` if you measured them",
-)
-ESTIMATED_INTENSITIES = WarningKind(
-    "estimated_intensities",
+    "RGB intensities with `--intensities FILE` if you measured them")
+ESTIMATED_INTENSITIES = WarningKind("estimated_intensities",
     "Light intensities were [estimated](image-preparation.md#estimated-light-intensities)",
-    "`--intensities FILE` if you measured them",
-)
-ESTIMATED_LIGHTS = WarningKind(
-    "estimated_lights",
+    "`--intensities FILE` if you measured them")
+ESTIMATED_LIGHTS = WarningKind("estimated_lights",
     "The light directions were [found from the images](unknown-lights.md)",
-    "Measure the lights if the expected error is too large",
-)
-EXIF_EXPOSURE = WarningKind(
-    "exif_exposure",
-    "EXIF states different exposures, by which the images were divided",
-    "Expose all images alike, with exposure and white balance fixed",
-)
-EXIF_ORIENTATION = WarningKind(
-    "exif_orientation",
+    "Measure the lights if the expected error is too large")
+EXIF_EXPOSURE = WarningKind("exif_exposure", "EXIF states different exposures, by which the images were divided",
+    "Expose all images alike, with exposure and white balance fixed")
+EXIF_ORIENTATION = WarningKind("exif_orientation",
     "An EXIF tag turns the images in viewers; splinecli uses the stored pixels",
-    "Make mask and lights for the stored pixels",
-)
+    "Make mask and lights for the stored pixels")
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
-GROUND_TRUTH_FRAME = WarningKind(
-    "ground_truth_frame",
+GROUND_TRUTH_FRAME = WarningKind("ground_truth_frame",
     "The ground truth fits the images only with x or y negated, or exchanged",
-    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`",
-    severity="error",
-)
-GROUND_TRUTH_SHIFTED = WarningKind(
-    "ground_truth_shifted",
-    "The ground truth fits the images only when it is moved",
-    "Align it with the images",
-    severity="error",
-)
+    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`", severity="error")
+GROUND_TRUTH_SHIFTED = WarningKind("ground_truth_shifted", "The ground truth fits the images only when it is moved",
+    "Align it with the images", severity="error")
 GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was turned upside down")
-GROUND_TRUTH_Z = WarningKind(
-    "ground_truth_z", "The ground truth points away from the camera", "Negate its z", severity="error"
-)
-IMAGE_INCONSISTENT = WarningKind(
-    "image_inconsistent",
+GROUND_TRUTH_Z = WarningKind("ground_truth_z", "The ground truth points away from the camera", "Negate its z",
+    severity="error")
+IMAGE_INCONSISTENT = WarningKind("image_inconsistent",
     "One image [contradicts the others](input-checks.md#one-odd-image)",
-    "Photograph it again, or leave it out with `--light-indices`",
-    severity="error",
-)
-IMAGE_SCALE = WarningKind(
-    "image_scale",
+    "Photograph it again, or leave it out with `--light-indices`", severity="error")
+IMAGE_SCALE = WarningKind("image_scale",
     "One image is 16, 64 or 256 times darker or brighter than the others predict, as 12 bits among 16 are",
-    "Save all images in one way",
-    severity="error",
-)
-IMAGES_ALIGNED = WarningKind(
-    "images_aligned", "The images were [aligned](image-preparation.md#moved-images), as `--align` asks"
-)
-IMAGES_LEFT_OUT = WarningKind(
-    "images_left_out",
+    "Save all images in one way", severity="error")
+IMAGES_ALIGNED = WarningKind("images_aligned",
+    "The images were [aligned](image-preparation.md#moved-images), as `--align` asks")
+IMAGES_LEFT_OUT = WarningKind("images_left_out",
     "The light file does not name all images, or pictures have names of masks or maps, or another size",
-    "Check names and sizes",
-)
-IMAGES_SHIFTED = WarningKind(
-    "images_shifted",
+    "Check names and sizes")
+IMAGES_SHIFTED = WarningKind("images_shifted",
     "Images are [shifted against the others](input-checks.md#shifted-images)",
-    "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod",
-    severity="error",
-)
-LAMP_DISTANCE = WarningKind(
-    "lamp_distance",
-    "A lamp is nearer than the object is wide, or hundreds of widths away",
-    "Use one unit for lamps and pixel size",
-    severity="error",
-)
-LIGHT_COLOURS = WarningKind(
-    "light_colours",
+    "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod", severity="error")
+LAMP_DISTANCE = WarningKind("lamp_distance", "A lamp is nearer than the object is wide, or hundreds of widths away",
+    "Use one unit for lamps and pixel size", severity="error")
+LIGHT_COLOURS = WarningKind("light_colours",
     "The lamps have different colours, and some lack a channel, so the colours cannot be divided out",
-    "White lamps, or RGB intensities",
-    severity="error",
-)
-LIGHT_FRAME = WarningKind(
-    "light_frame",
+    "White lamps, or RGB intensities", severity="error")
+LIGHT_FRAME = WarningKind("light_frame",
     "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated, or half vectors",
-    "`--light-frame` or `info --mended-lights`, as the warning says",
-    severity="error",
-)
-LIGHT_ORDER = WarningKind(
-    "light_order",
-    "The lights are probably in another order than the images",
-    "Correct the light file",
-    severity="error",
-)
-LIGHTS_ILL_CONDITIONED = WarningKind(
-    "lights_ill_conditioned", "The lights determine the normals badly", "Add lights from other sides"
-)
-LIGHTS_IN_CHANNELS = WarningKind(
-    "lights_in_channels",
+    "`--light-frame` or `info --mended-lights`, as the warning says", severity="error")
+LIGHT_ORDER = WarningKind("light_order", "The lights are probably in another order than the images",
+    "Correct the light file", severity="error")
+LIGHTS_ILL_CONDITIONED = WarningKind("lights_ill_conditioned", "The lights determine the normals badly",
+    "Add lights from other sides")
+LIGHTS_IN_CHANNELS = WarningKind("lights_in_channels",
     "Each channel of the images counts as a light, as `--lights-in-channels` asks; coloured objects get wrong normals",
-    "A [crosstalk matrix](coloured-lights.md), and gray objects",
-)
-LIGHTS_MATCHED = WarningKind(
-    "lights_matched",
-    "Lights were matched to images by another rule than the full name",
-    "Check the order of the lights",
-)
+    "A [crosstalk matrix](coloured-lights.md), and gray objects")
+LIGHTS_MATCHED = WarningKind("lights_matched", "Lights were matched to images by another rule than the full name",
+    "Check the order of the lights")
 LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the camera axis", "Add lower lights")
-LIGHTS_UNCHECKED = WarningKind(
-    "lights_unchecked",
+LIGHTS_UNCHECKED = WarningKind("lights_unchecked",
     "Shadows that the lights should cast are missing; with `--strict`, also where the order or the frame of the "
-    "lights [cannot be checked](input-checks.md#wrong-light-directions)",
-    "Compare bumps and hollows with the object",
-)
-LOW_CONFIDENCE = WarningKind(
-    "low_confidence",
-    "The network finds nearly all normals uncertain",
-    "Check the lights, the mask and the images",
-    severity="error",
-)
-MASK_CHOICE = WarningKind(
-    "mask_choice",
+    "lights [cannot be checked](input-checks.md#wrong-light-directions)", "Compare bumps and hollows with the object")
+LOW_CONFIDENCE = WarningKind("low_confidence", "The network finds nearly all normals uncertain",
+    "Check the lights, the mask and the images", severity="error")
+MASK_CHOICE = WarningKind("mask_choice",
     "There is no `mask.*`, so a picture with the word `mask` in its name, or the alpha channel of the images, is the "
-    "mask; of several pictures, none is",
-    "`--mask FILE` for another one",
-)
-MASK_INVERTED = WarningKind(
-    "mask_inverted",
-    "The mask leaves out a bright area in the middle",
-    "Invert it: white on the object",
-    severity="error",
-)
-NEAR_LAMPS = WarningKind(
-    "near_lamps",
+    "mask; of several pictures, none is", "`--mask FILE` for another one")
+MASK_INVERTED = WarningKind("mask_inverted", "The mask leaves out a bright area in the middle",
+    "Invert it: white on the object", severity="error")
+NEAR_LAMPS = WarningKind("near_lamps",
     "The folder has positions, or vectors look like positions, but the lights count as distant",
-    "`--light-positions FILE`, or leave `--lights` out",
-)
-NEAR_LIGHTS_SUSPECTED = WarningKind(
-    "near_lights_suspected",
+    "`--light-positions FILE`, or leave `--lights` out")
+NEAR_LIGHTS_SUSPECTED = WarningKind("near_lights_suspected",
     "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
-    "[Say where they are](near-lamps.md)",
-    severity="error",
-)
-NO_MASK = WarningKind(
-    "no_mask", "No mask leaves out pixels, and most of them are near black", "`--auto-mask`, or a mask"
-)
-NONLINEARITY_SUSPECTED = WarningKind(
-    "nonlinearity_suspected",
+    "[Say where they are](near-lamps.md)", severity="error")
+NO_MASK = WarningKind("no_mask", "No mask leaves out pixels, and most of them are near black",
+    "`--auto-mask`, or a mask")
+NONLINEARITY_SUSPECTED = WarningKind("nonlinearity_suspected",
     "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read as linear",
-    "`--transfer srgb` or `gamma:2.2`",
-    severity="error",
-)
-NOT_DISTILLED = WarningKind(
-    "not_distilled",
-    "A small network could not learn this large capture, so it took longer",
-    "none; `--method iw12` is faster",
-)
-PROFILE_UNREAD = WarningKind(
-    "profile_unread", "The curve of a colour profile cannot be read", "`--transfer linear`, `srgb` or `gamma:G`"
-)
-REFINED_LIGHTS = WarningKind(
-    "refined_lights", "`--refine-lights` moved the light directions", "Compare with the given directions"
-)
+    "`--transfer srgb` or `gamma:2.2`", severity="error")
+NOT_DISTILLED = WarningKind("not_distilled", "A small network could not learn this large capture, so it took longer",
+    "none; `--method iw12` is faster")
+PROFILE_UNREAD = WarningKind("profile_unread", "The curve of a colour profile cannot be read",
+    "`--transfer linear`, `srgb` or `gamma:G`")
+REFINED_LIGHTS = WarningKind("refined_lights", "`--refine-lights` moved the light directions",
+    "Compare with the given directions")
 REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
-REPEATED_IMAGES = WarningKind(
-    "repeated_images", "Two images are equal, their lights are not", "Replace one of them", severity="error"
-)
-ROUGH_LIGHTS = WarningKind(
-    "rough_lights",
-    "Refined light directions would fit much better",
-    "[`--refine-lights`](infer.md#rough-directions), or measure them again",
-)
+REPEATED_IMAGES = WarningKind("repeated_images", "Two images are equal, their lights are not", "Replace one of them",
+    severity="error")
+ROUGH_LIGHTS = WarningKind("rough_lights", "Refined light directions would fit much better",
+    "[`--refine-lights`](infer.md#rough-directions), or measure them again")
 SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Expose shorter")
-UNEQUAL_INTENSITIES = WarningKind(
-    "unequal_intensities",
+UNEQUAL_INTENSITIES = WarningKind("unequal_intensities",
     "Light intensities look unequal, but the images do not determine them; or those of the file do not fit the images",
-    "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
-    severity="error",
-)
-UNTRAINED_LIGHTS = WarningKind(
-    "untrained_lights",
-    "The weights were not trained with this number of lights",
-    "`--n-lights`, other weights, or `--method spline-net`",
-)
-WHITE_LEVEL = WarningKind(
-    "white_level",
+    "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file", severity="error")
+UNTRAINED_LIGHTS = WarningKind("untrained_lights", "The weights were not trained with this number of lights",
+    "`--n-lights`, other weights, or `--method spline-net`")
+WHITE_LEVEL = WarningKind("white_level",
     "The images look clipped below full scale, or no value of 16-bit files is above 10 or 12 bits",
-    "`--white-level N` sets another value",
-)
+    "`--white-level N` sets another value")
+# fmt: on
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
-
 SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
 
 

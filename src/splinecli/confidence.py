@@ -20,28 +20,18 @@ from splinecli.methods.estimator import Estimator
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-FEWEST_LIGHTS = 5  # with fewer, the residuals of a fit are not enough to assess a capture
-
-FEWEST_PIXELS = 50
-
-_BLOCKS = 2500  # over which normals are averaged for their curl
-_DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels carry no information about the capture
+FEWEST_LIGHTS, FEWEST_PIXELS = 5, 50  # with fewer, the residuals of a fit are not enough to assess a capture
 _FITS = 4
-_MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
 def correct_errors(
     capture: Capture, estimator: Estimator, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array
 ) -> bool:
-    """Correct the distributions of errors (P, 2) in place; return whether that was possible.
+    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether that was possible.
 
     It is impossible if the capture is too small, or if the correction was not made for the estimator's weights. A pixel
-    that is dark under every light stays as it is.
-
-    Args:
-        lighting_at: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
+    that is dark under every light stays as it is. `lighting_at` gives the light of some pixels.
     """
     import torch
 
@@ -138,11 +128,8 @@ def capture_features(
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
-    Args:
-        mask: (H, W), with P true pixels.
-        lighting_at: gives the observations and the light directions of some pixels.
-        normals, errors: (P, 3) and (P, 2), the estimate. See networks/li_ne_net.py.
-        lights: (F, 3), unit; of near lamps, at the origin.
+    The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py. Lights are (F, 3),
+    unit; of near lamps, at the origin. `lighting_at` gives the light of some pixels.
     """
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
@@ -151,14 +138,17 @@ def capture_features(
     light = lighting_at(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
-    kept = brightness > _DARK_SHARE * bright
+    kept = brightness > 0.1 * bright  # darker pixels carry no information about the capture
     if np.count_nonzero(kept) < FEWEST_PIXELS:
         return None
     values = light.observations[kept].astype(np.float64)
     values /= values.max(axis=1, keepdims=True)
     own = normals[rows][kept].astype(np.float64)
-    if light.directions.ndim == 3:
-        values = _as_distant(values, light.in_frame_of_capture(light.directions)[kept], lights)
+    if light.directions.ndim == 3:  # convert the values of matte pixels to distant lights
+        directions = light.in_frame_of_capture(light.directions)[kept]
+        scaled = fit_scaled_normals(values, (values > LIT_SHARE).astype(np.float64), directions.astype(np.float64))
+        values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
+        values = np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
     lit = (values > LIT_SHARE).astype(np.float64)
     shaded = (lit * values).sum(axis=1).clip(min=LIT_SHARE)
 
@@ -177,7 +167,8 @@ def capture_features(
         scaled_terms = fit_scaled_normals(terms, weights, lights)
         terms = terms - scaled_terms @ lights.T
         power = (weights * terms**2).sum()
-        amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-_MOST, _MOST))
+        # The terms hold to first order in width over distance, or in the change of the exponent.
+        amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-1.5, 1.5))
         share = amount**2 * power / max((weights * residuals**2).sum(), 1e-12)
         turn = angle_between_deg(best, unit(scaled - sign * max(sign * amount, 0.0) * scaled_terms))
         return amount, float(share), _log_median(turn, _LEAST_DEG)
@@ -204,19 +195,16 @@ def capture_features(
         shadow=float(1 - lit.mean()),
         dark=float(1 - kept.mean()),
     )
-    return features, replace(scale, turning=max(near[0], 0.0) * _turning(lights))
+    # By how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)
+    solve = np.linalg.pinv(lights)
+    turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
+    for axis in range(2):
+        turning[:, axis, axis] -= solve.sum(axis=1)
+    return features, replace(scale, turning=max(near[0], 0.0) * np.asarray(turning))
 
 
 def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
     return float(np.log(np.median(values) + least))
-
-
-def _as_distant(values: Float64Array, directions: Floats, lights: Float64Array) -> Float64Array:
-    """Return values (p, F) under directions (p, F, 3) converted for matte pixels to lights (F, 3)."""
-    lit = (values > LIT_SHARE).astype(np.float64)
-    scaled = fit_scaled_normals(values, lit, directions.astype(np.float64))
-    values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
-    return np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
 
 
 def _residuals_under(
@@ -231,15 +219,6 @@ def _residuals_under(
         left = values - albedo[:, None] * cosines
         weights = seen * absolute_weights(left)
     return np.asarray(left)
-
-
-def _turning(lights: Float64Array) -> Float64Array:
-    """Return by how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)."""
-    solve = np.linalg.pinv(lights)
-    turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
-    for axis in range(2):
-        turning[:, axis, axis] -= solve.sum(axis=1)
-    return np.asarray(turning)
 
 
 def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, float, float, float]:
@@ -260,7 +239,7 @@ def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, floa
 
 def _of_shape(mask: Bools, places: PixelPlaces, normals: Floats) -> tuple[float, float]:
     """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
-    blocks = Blocks.over(mask, _BLOCKS)
+    blocks = Blocks.over(mask, 2500)
     if min(blocks.mask.shape) < 2:
         return np.nan, np.nan
     sums = np.zeros((3, np.count_nonzero(blocks.mask)))

@@ -1,6 +1,7 @@
 """The errors that splinecli raises on purpose. Each has an exit code and a hint with a remedy."""
 
 from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +37,8 @@ class SplinecliError(Exception):
         super().__init__(printable(f"{place}{problem}." + (f" {hint}." if hint else "")))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _copy, (type(self), self.problem, self.path, self.line, self.hint)
-
-
-def _copy(
-    kind: type[SplinecliError], problem: str, path: Path | None, line: int | None, hint: str | None
-) -> SplinecliError:
-    """Return an error that another process raised."""
-    return kind(problem, path=path, line=line, hint=hint)
+        """Pickle the error for another process."""
+        return partial(type(self), path=self.path, line=self.line, hint=self.hint), (self.problem,)
 
 
 class UsageError(SplinecliError):

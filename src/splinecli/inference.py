@@ -5,15 +5,12 @@ normals, integrate them, move the pixels onto the surface, and fit again with th
 inverse-square falloff that the lamps have there. The surface begins as the object's mean plane. (Logothetis et al., "A
 CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
 
-If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
-
-The pixels are processed in tiles, so the working memory of a method depends on the tile size; only the results grow
-with the capture.
+If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined. Pixels
+are processed in tiles, so that only the results grow with the capture.
 """
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -24,16 +21,14 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence import add_common_error, correct_errors
 from splinecli.errors import SplinecliError
+from splinecli.lights import lighting
 from splinecli.lights.lighting import (
     IndirectLight,
     LightingAt,
     PixelIndices,
     PixelLighting,
     PixelPlaces,
-    find_indirect_light,
-    flat_depth,
     parts_of_pixels,
-    surface_points,
 )
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator, make_estimator
@@ -41,12 +36,9 @@ from splinecli.methods.estimator import TILE_PIXELS, confidence
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Clock, Progress
 
-METHOD = "iw12"  # the intermediate fit: fast, and robust against shadows and highlights
-
-PIXELS_ON_THE_WAY = 40_000
-"""Larger captures are fitted at about this size in between: fine detail hardly moves the surface."""
+PIXELS_ON_THE_WAY = 40_000  # larger captures are fitted at about this size: fine detail hardly moves the surface
 
 
 def find_surface(capture: Capture) -> Capture:
@@ -54,14 +46,14 @@ def find_surface(capture: Capture) -> Capture:
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
-    estimator = make_estimator(METHOD)
+    estimator = make_estimator("iw12")  # the intermediate fit: fast, and robust against shadows and highlights
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
-    depth = np.full(blocks.mask.shape, flat_depth(lamps))
+    depth = np.full(blocks.mask.shape, lighting.flat_depth(lamps))
     # Intermediate fits. An error of the surface only matters as a share of the distance of the lamps, so few are
     # enough.
     for _ in range(2):
-        points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
+        points = lighting.surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = PixelLighting.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
         normal_map = np.zeros((*blocks.mask.shape, 3))
@@ -70,13 +62,8 @@ def find_surface(capture: Capture) -> Capture:
         if lamps.camera_matrix is None:
             depth *= blocks.step  # from blocks to pixels
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
-    points = surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
+    points = lighting.surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
     return replace(capture, lamps=replace(lamps, points=points))
-
-
-Stage = Callable[[str], AbstractContextManager[Progress]]
-
-_UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
 
 @dataclass(frozen=True)
@@ -112,26 +99,18 @@ def estimate_normals(
     capture: Capture,
     estimator: Estimator,
     *,
-    tile_pixels: int | None = None,
     progress: Progress | None = None,
-    stage: Stage | None = None,
+    clock: Clock | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
-    The capture of the result has the points of this surface.
-
-    Args:
-        tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
-        progress: called with the number of pixels just finished, after each batch of the estimator.
-        stage: called with the name of each later stage when it begins; its function is called with the number of
-            pixels just finished.
-
-    Raises:
-        SplinecliError: the estimator gave normals that are not unit vectors.
+    The capture of the result has the points of this surface. `progress` is called with the number of pixels just
+    finished, after each batch of the estimator. The clock times the stages that follow, and shows them. Raises
+    SplinecliError if the normals are not unit vectors.
     """
     started = time.perf_counter()
     capture = find_surface(capture)
-    normals, errors, judged = _estimate(capture, estimator, tile_pixels, progress, stage)
+    normals, errors, judged = _estimate(capture, estimator, progress, clock or Clock())
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
@@ -150,20 +129,18 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture, estimator: Estimator, tile_pixels: int | None, progress: Progress | None, stage: Stage | None
+    capture: Capture, estimator: Estimator, progress: Progress | None, clock: Clock
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
     Methods without confidence have no distributions.
     """
-    found = estimate_pixels(
-        capture.mask, capture.observations, lighting_on(capture), estimator, tile_pixels, progress, stage
-    )
+    found = estimate_pixels(capture.mask, capture.observations, lighting_on(capture), estimator, progress, clock)
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner
     if refiner is not None and errors is not None:
-        with (stage or _no_stage)("refining") as advance:
-            refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
+        advance = clock.begin("refine", capture.n_pixels, "refining")
+        refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
     judged = errors is not None and correct_errors(capture, estimator, found.lighting_at, normals, errors)
     if errors is not None:
         found_lights = [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
@@ -191,9 +168,8 @@ def estimate_pixels(
     observations: NDArray[np.float32],
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
-    tile_pixels: int | None = None,
     progress: Progress | None = None,
-    stage: Stage | None = None,
+    clock: Clock | None = None,
 ) -> PixelEstimates:
     """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
 
@@ -203,10 +179,9 @@ def estimate_pixels(
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
         lighting_without: gives the light of some pixels without the given indirect light; None removes nothing.
-        tile_pixels, progress, stage: see estimate_normals.
+        progress, clock: see estimate_normals.
     """
-    tile_pixels = tile_pixels or estimator.tile_pixels
-    n_pixels = len(observations)
+    clock, n_pixels = clock or Clock(), len(observations)
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
@@ -217,28 +192,24 @@ def estimate_pixels(
         normals[pixels] = light.in_frame_of_capture(found)
 
     lighting_at = partial(lighting_without, None)
-    refiner = estimator.refiner
+    refiner, tile_pixels = estimator.refiner, estimator.tile_pixels
     estimator = estimator.bind(lighting_at, n_pixels)
     for pixels in parts_of_pixels(n_pixels, tile_pixels):
         estimate(pixels, lighting_at(pixels), progress)
     if refiner is None or errors is None:
         return PixelEstimates(normals, errors, lighting_at)
-    with (stage or _no_stage)("removing indirect light") as advance:
-        indirect = find_indirect_light(mask, observations, lighting_at, normals)
-        if indirect is not None:
-            lighting_at = partial(lighting_without, indirect)
-            # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
-            estimator = estimator.rebind(lighting_at, n_pixels)
-            for pixels in parts_of_pixels(n_pixels, tile_pixels):
-                changed = pixels[indirect.counts_at(observations[pixels], pixels)]
-                if len(changed):
-                    estimate(changed, lighting_at(changed))
-                advance(len(pixels))
+    advance = clock.begin("indirect_light", n_pixels, "removing indirect light")
+    indirect = lighting.find_indirect_light(mask, observations, lighting_at, normals)
+    if indirect is not None:
+        lighting_at = partial(lighting_without, indirect)
+        # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
+        estimator = estimator.rebind(lighting_at, n_pixels)
+        for pixels in parts_of_pixels(n_pixels, tile_pixels):
+            changed = pixels[indirect.counts_at(observations[pixels], pixels)]
+            if len(changed):
+                estimate(changed, lighting_at(changed))
+            advance(len(pixels))
     return PixelEstimates(normals, errors, lighting_at)
-
-
-def _no_stage(_: str) -> AbstractContextManager[Progress]:
-    return nullcontext(lambda _: None)
 
 
 def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndices], PixelLighting]:
@@ -271,5 +242,5 @@ def _check_unit(normals: NDArray[np.float32], method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
-        if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():
+        if not (np.abs(length - 1) <= 1e-2).all():  # accepts float16 and bfloat16, rejects zero vectors and NaN
             raise SplinecliError(f"method {method} gave normals that are not unit vectors")

@@ -8,33 +8,18 @@ from dataclasses import dataclass
 
 from splinecli.surface.surface_files import LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 
-NORMALS = {
-    "png": "normals.png",
-    "png8": "normals_8bit.png",
-    "npy": "normals.npy",
-    "tiff": "normals.tiff",
-    "exr": "normals.exr",
-}
+# The file of the normal map in each format
+NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff",
+           "exr": "normals.exr"}  # fmt: skip
 """The file of the normal map in each format."""
 
 ERROR_MAP = "error_map.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-FOUND_LIGHTS = FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = (
-    "light_directions.txt",
-    "light_intensities.txt",
-    "lights.png",
-)
-"""Files with the lights estimated by `infer`. If results and capture share a folder, they may be the user's own."""
-
-PLOTS = CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = (
-    "calibration.png",
-    "light_noise.png",
-    "contact_sheet.png",
-    "curves.png",
-    "maps.png",
-)
-"""Pictures that the other commands write."""
-
+# With the lights estimated by `infer`. If results and capture share a folder, they may be the user's own.
+FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
+FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
+PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")  # of the other commands
+CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
 CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values shown as white in the pictures by default
 BYTES_OF_SURFACE = 600  # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 
@@ -74,78 +59,44 @@ class OutputMap:
         return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
 
 
+# fmt: off
 _ROWS = (
-    OutputMap(
-        name="albedo",
-        make="splinecli.results.maps:albedo",
+    OutputMap(name="albedo", make="splinecli.results.maps:albedo",
         content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear RGB, up to one scale."
         " The picture is 8-bit sRGB, the EXR file float16",
-        unit="linear RGB",
-        suffixes=("npy", "exr", "png"),
-        picture="splinecli.pictures.maps:albedo_picture",
-        caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
-        reads_images=True,
-        bytes_per_pixel=52,  # the colours of two images, sums and the map
-        bytes_per_observation=1,
-    ),
-    OutputMap(
-        name="confidence",
-        make="splinecli.results.maps:confidence",
+        unit="linear RGB", suffixes=("npy", "exr", "png"), picture="splinecli.pictures.maps:albedo_picture",
+        caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white", reads_images=True,
+        bytes_per_pixel=52, bytes_per_observation=1),  # the colours of two images, sums and the map
+    OutputMap(name="confidence", make="splinecli.results.maps:confidence",
         content="the probability that a normal has an error of at most 5 degrees; float32, H x W, zero outside the"
         " mask; white is 1",
-        suffixes=("npy", "png"),
-        picture="splinecli.pictures.maps:confidence_picture",
+        suffixes=("npy", "png"), picture="splinecli.pictures.maps:confidence_picture",
         caption="Confidence: the probability that the normal is at most 5° off, from 0 (black) to 1 (white)",
-        needs_confidence=True,
-    ),
-    OutputMap(
-        name="preview",
-        make="splinecli.results.maps:normals",
-        content="the surface in matte white under a raking light from the upper left",
-        suffixes=("png",),
-        picture="splinecli.pictures.maps:preview_picture",
-    ),
-    OutputMap(
-        name="gradient",
-        make="splinecli.results.maps:gradient",
+        needs_confidence=True),
+    OutputMap(name="preview", make="splinecli.results.maps:normals",
+        content="the surface in matte white under a raking light from the upper left", suffixes=("png",),
+        picture="splinecli.pictures.maps:preview_picture"),
+    OutputMap(name="gradient", make="splinecli.results.maps:gradient",
         content="the slopes dz/dx and dz/dy; float32, H x W x 2, NaN outside the mask",
-        unit="slopes dz/dx and dz/dy, x right, y up",
-        suffixes=("npy", "tiff"),
-    ),
-    OutputMap(
-        name="curvature",
-        make="splinecli.results.maps:curvature",
+        unit="slopes dz/dx and dz/dy, x right, y up", suffixes=("npy", "tiff")),
+    OutputMap(name="curvature", make="splinecli.results.maps:curvature",
         content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
         " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 for each part",
-        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
-        scale=CURVATURE_SCALE,
-        scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
-    ),
-    OutputMap(
-        name="relief",
-        make="splinecli.results.maps:relief",
+        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2", scale=CURVATURE_SCALE,
+        scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel"),
+    OutputMap(name="relief", make="splinecli.results.maps:relief",
         content="heights without the overall shape; float32, H x W, in pixels, NaN outside the mask. The high-pass"
         " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
-        unit="heights in pixels",
-        scale=RELIEF_SCALE,
-        scale_text="height, black -{scale}, gray 0, white {scale} pixels",
-        bytes_per_pixel=BYTES_OF_SURFACE,
-    ),
+        unit="heights in pixels", scale=RELIEF_SCALE,
+        scale_text="height, black -{scale}, gray 0, white {scale} pixels", bytes_per_pixel=BYTES_OF_SURFACE),
 )
+# fmt: on
 MAPS = {row.name: row for row in _ROWS}
 SCALED_MAPS = tuple(row.name for row in _ROWS if row.scale is not None)
 
 
 def own_files() -> list[str]:
     """Return the names of all files that `infer` and `integrate` may write to a folder, except FOUND_LIGHTS."""
-    return [
-        *NORMALS.values(),
-        ERROR_MAP,
-        *(name for row in MAPS.values() for name in row.files.values()),
-        *file_names(tuple(SURFACE_FILES)),
-        *LEVEL_NORMALS,
-        SURFACE_REPORT,
-        FOUND_MASK,
-        PAGE,
-        REPORT,
-    ]
+    maps = (name for row in MAPS.values() for name in row.files.values())
+    surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)
+    return [*NORMALS.values(), ERROR_MAP, *maps, *surface, FOUND_MASK, PAGE, REPORT]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from functools import lru_cache
 from math import isfinite
@@ -20,15 +21,13 @@ from msgspec.structs import replace
 from splinecli.errors import SplinecliError, UsageError, check_one_of
 
 ARGUMENTS = "Arguments"
+# The panels of the help, in order
 PANELS = (
     *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights", "Light intensities"),
     *("Method", "Output", "Speed", "Processes and machines"),
 )
-"""The panels of the help, in order."""
-
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
-
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -150,13 +149,11 @@ def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, stric
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
-    try:
+    with suppress(ValidationError):
         found = convert(value, kind, strict=strict)
         items = found.values() if isinstance(found, dict) else _each(found)
         if all(isfinite(item) for item in items if isinstance(item, float)):
             return found
-    except ValidationError:
-        pass
     raise error(f"{title} is {value!r}; expected {in_words(kind)}")
 
 
@@ -178,7 +175,6 @@ def limits(kind: Any) -> Meta:
 
 
 def _metadata(kind: Any) -> Iterator[Any]:
-    """Yield the annotations of a type and its parts."""
     yield from getattr(kind, "__metadata__", ())
     for part in get_args(kind):
         yield from _metadata(part)

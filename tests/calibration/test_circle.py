@@ -5,17 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.capture import read_image, read_mask
 from splinecli.errors import InputError
 
 TRUE = Circle(103.3, 88.7, 61.4)
-
-
-def disc(circle: Circle = TRUE, shape: tuple[int, int] = (180, 210)) -> NDArray[np.bool_]:
-    return circle.inside(shape)
 
 
 def assert_close(found: Circle, true: Circle, pixels: float) -> None:
@@ -26,7 +21,7 @@ def assert_close(found: Circle, true: Circle, pixels: float) -> None:
 @pytest.mark.parametrize("with_stand", [False, True])
 def test_circle_of_a_mask(with_stand: bool) -> None:
     """A stand and specks do not move the circle."""
-    mask = disc()
+    mask = TRUE.inside((180, 210))
     if with_stand:
         mask[130:, 90:118] = mask[5:8, 5:8] = True
     found = circle_from_mask(mask)
@@ -36,18 +31,18 @@ def test_circle_of_a_mask(with_stand: bool) -> None:
 
 def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
     beyond = Circle(40.0, 88.7, 61.4)
-    found = circle_from_mask(disc(beyond))
+    found = circle_from_mask(beyond.inside((180, 210)))
     assert_close(found, beyond, 0.4)
     assert found.reaches_beyond((180, 210))
     assert not TRUE.reaches_beyond((180, 210))
 
 
-@pytest.mark.parametrize(
-    "mask", [np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)], ids=["all", "bar"]
-)
-def test_masks_that_are_no_ball(mask: NDArray[np.bool_]) -> None:
-    with pytest.raises(InputError, match="expected a ball"):
-        circle_from_mask(mask)
+def test_masks_and_pictures_that_are_no_ball() -> None:
+    for mask in (np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)):
+        with pytest.raises(InputError, match="expected a ball"):
+            circle_from_mask(mask)
+    with pytest.raises(InputError, match="found no circle"):
+        find_circle(np.tile(np.linspace(0, 1, 200), (150, 1)))
 
 
 @pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
@@ -55,16 +50,11 @@ def test_masks_that_are_no_ball(mask: NDArray[np.bool_]) -> None:
 def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
     true = Circle(scale * TRUE.x, scale * TRUE.y, scale * TRUE.radius)
     shape = (180 * scale, 210 * scale)
-    picture = np.where(disc(true, shape), ball, wall)
+    picture = np.where(true.inside(shape), ball, wall)
     picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
     found = find_circle(picture.clip(0))
     assert_close(found, true, 0.5 * max(1, scale / 3))
     assert found.visible > 0.9
-
-
-def test_no_circle_in_a_picture() -> None:
-    with pytest.raises(InputError, match="found no circle"):
-        find_circle(np.tile(np.linspace(0, 1, 200), (150, 1)))
 
 
 def test_normals_of_the_ball() -> None:

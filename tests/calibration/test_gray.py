@@ -51,14 +51,10 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
     np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
-def test_a_ball_without_a_mask_is_refused(tmp_path: Path) -> None:
-    folder = write(tmp_path / "dark", np.zeros((3, 20, 30, 3)), None)
+def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Path) -> None:
+    folder = write(tmp_path / "card", np.full((3, 20, 30, 3), 0.5), None)
     with pytest.raises(InputError, match="images of the gray ball need a mask"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-
-
-def test_images_and_masks_of_another_size(tmp_path: Path) -> None:
-    folder = write(tmp_path / "card", np.full((3, 20, 30, 3), 0.5), None)
     cv2.imwrite(str(folder / "1.png"), np.full((20, 31), 30_000, np.uint16))
     with pytest.raises(InputError, match=r"1\.png: found an image of 31 x 20 pixels, expected 30 x 20 as in 0\.png"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")

@@ -4,6 +4,7 @@ The oracle is a matte sphere: whatever its files are called, the normals are tho
 """
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -65,6 +66,8 @@ def test_masks_by_name(folder: Path, name: str) -> None:
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert str(source.warnings[0]).startswith(f"{Path(name).name} is used as the mask, by its name.")
+    balls = find_ball_files(folder)
+    assert len(balls.images) == 12 and balls.mask == source.files.mask
 
 
 def test_two_masks_are_named_and_none_is_used(folder: Path) -> None:
@@ -86,13 +89,6 @@ def test_alpha_is_a_mask_if_there_is_no_other(folder: Path) -> None:
     assert "The alpha channel of 000.png is used as the mask." in str(source.warnings[0])
     picture(folder / "mask.png", np.full_like(MASK, 255))
     assert check(open_capture(folder), np.ones_like(DISC)) == []
-
-
-def test_ball_masks(folder: Path) -> None:
-    (folder / "light_directions.txt").unlink()
-    picture(folder / "chrome.mask.png", MASK)
-    files = find_ball_files(folder)
-    assert len(files.images) == 12 and files.mask == folder / "chrome.mask.png"
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -128,7 +124,22 @@ LINES = "\n".join(" ".join(map(str, row)) for row in rows())
 NAMED = "\n".join(f"{number:03}.png {' '.join(map(str, row))}" for number, row in enumerate(rows()))
 OPENCV = f"%YAML:1.0\nLights: !!opencv-matrix\n   rows: 12\n   cols: 3\n   dt: d\n   data: {LIGHTS.ravel().tolist()}\n"
 XYZ = [dict(zip("xyz", row, strict=True)) for row in rows()]
+
+
+def alice(names: list[str], **more: object) -> str:
+    lights = [{"viewId": n, "direction": [x, -y, -z], **more} for n, (x, y, z) in zip(names, rows(), strict=True)]
+    return json.dumps({"lights": lights})
+
+
+NUMBERS = [f"{number:03}" for number in range(12)]
 FOUND = {
+    "University of Washington": ("lights.txt", f"12\n{LINES}"),
+    "lp": ("dome.lp", f"12\n{NAMED}"),
+    "foreign paths": ("a.LP", "12\n" + re.sub("^", r"C:\\\\RTI\\\\a vase\\\\", NAMED, flags=re.MULTILINE)),
+    "by name without suffix": ("a.lp", NAMED.replace(".png", ".JPG")),
+    "by order": ("a.lp", "12\n" + re.sub("^", "gone", NAMED, flags=re.MULTILINE)),
+    "AliceVision, by name without suffix": ("lights.json", alice(NUMBERS, type="directional")),
+    "AliceVision with intensities, by order": ("lights.json", alice(["47", *NUMBERS[1:]], intensity=[1, 1.0, 1])),
     "csv": ("lights.csv", "x,y,z\n" + LINES.replace(" ", ",")),
     "csv with names": ("lights.csv", "image,x,y,z\n" + NAMED.replace(" ", ",")),
     "list": ("lights.txt", str(rows())),
@@ -151,7 +162,71 @@ def test_light_files(folder: Path, case: str) -> None:
     (folder / "light_directions.txt").unlink()
     name, text = FOUND[case]
     (folder / name).write_text(text)
-    assert check(open_capture(folder), None) == []
+    source, by = open_capture(folder), case[case.find("by") :]
+    matched = case.endswith(("by order", "without suffix"))
+    assert check(source, None) == ["lights_matched"] * matched
+    assert not matched or str(source.warnings[0]).endswith(f"were matched to the images {by}.")
+
+
+REFUSED = {
+    "a.lp": [
+        ("", "the file is empty, expected the number of lights on the first line"),
+        ("many\na.png 0 0 1", '1: found "many", expected the number of lights'),
+        (f"6\n{NAMED}", "1: the first line says 6 lights, but 12 lines follow"),
+        ("0\n", "1: the file contains no lights"),
+        ("1\n0 0 1", '2: found "0 0 1", expected a file name and x y z'),
+        ("1\na.png 0 zero 1", '2: found "zero", expected a number'),
+        ("1\na.png 0 0 0", "2: found a zero vector, expected a light direction"),
+        ("2\na.png 0 0 1\nb.png 0 1 -1", "3: found a light below the horizon (z = -1), expected z > 0"),
+        ("2\na.png 0 0 1\nA.PNG 0 1 1", '3: a second light for the image "A.PNG"'),
+        ("2\n000.png 0 0 1\nx.png 0 1 1", '3: found 2 lights but 12 images; the image "x.png" is not among them'),
+    ],
+    "lights.json": [
+        ("{", "is not JSON (Expecting property name enclosed in double quotes)"),
+        ("[]", 'found no list "lights"'),
+        ('{"lights": []}', 'found no list "lights"'),
+        ('{"lights": [3]}', "light 1 is not an object"),
+        ('{"lights": [{"type": "point", "direction": [0, 0, -1]}]}', "is of type 'point', expected 'directional'"),
+        ('{"lights": [{"direction": [0, 0]}]}', "light 1 has 'direction' [0, 0], expected three numbers"),
+        ('{"lights": [{"direction": [0, 0, NaN]}]}', "light 1 has 'direction' [0, 0, nan], expected three numbers"),
+        ('{"lights": [{}]}', "light 1 has 'direction' None, expected three numbers"),
+        ('{"lights": [{"direction": [0, 0, 1]}]}', "found a light below the horizon as light 1 (z = -1)"),
+        ('{"lights": [{"direction": [0, 0, -1], "intensity": [1, 0, 1]}]}', "light 1 has the intensity 0"),
+        ('{"lights": [{"direction": [0, 0, -1], "intensity": [1, 1, 1]}, {"viewId": 2, "direction": [0, 0, -1]}]}',
+         "1 of 2 lights have an intensity, expected all or none"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"), [(name, *case) for name, cases in REFUSED.items() for case in cases]
+)
+def test_refused_light_files(folder: Path, name: str, text: str, message: str) -> None:
+    (folder / "light_directions.txt").unlink()
+    (folder / name).write_text(text)
+    with pytest.raises(InputError) as refused:
+        open_capture(folder)
+    assert str(refused.value).startswith(f"{folder / name}:") and message in str(refused.value)
+
+
+def test_intensities_of_the_json_count_unless_a_file_is_given(folder: Path, tmp_path: Path) -> None:
+    (folder / "light_directions.txt").unlink()
+    (folder / "lights.json").write_text(alice(NUMBERS, intensity=[2.0, 1.0, 0.5]))
+    assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 12
+    (tmp_path / "intensities.txt").write_text("3\n" * 12)
+    assert open_capture(folder, intensities=tmp_path / "intensities.txt").light_intensities.tolist() == [[3.0] * 3] * 12
+
+
+def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -> None:
+    (folder / "light_directions.txt").unlink()
+    for path in folder.glob("*.png"):
+        path.rename(folder / f"schräg {path.name}")
+    lines = re.sub("^", "schräg ", NAMED, flags=re.MULTILINE).splitlines()[:4]
+    (folder / "capture.lp").write_bytes("\n".join(["4", *lines]).encode("latin-1"))
+    source = open_capture(folder)
+    assert [path.name for path in source.files.images] == [f"schräg {number}.png" for number in NUMBERS[:4]]
+    assert [warning.code for warning in source.warnings] == ["images_left_out"]
+    assert "names 4 of the 12 images; the others are left out" in str(source.warnings[0])
 
 
 @pytest.mark.parametrize(
@@ -159,11 +234,7 @@ def test_light_files(folder: Path, case: str) -> None:
     [
         ("../lights.txt", LINES, r"Add --lights .*lights\.txt\."),
         ("dirs.txt", LINES, r"Add --lights .*cat/dirs\.txt\."),
-        (
-            "TiltSlant.txt",
-            "tilt slant\n" + angles("slant-tilt"),
-            r"Add .*Slant\.txt --light-format slant-tilt",
-        ),
+        ("TiltSlant.txt", "tilt slant\n" + angles("slant-tilt"), r"Add .*Slant\.txt --light-format slant-tilt"),
         ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --light-format azel"),
     ],
 )

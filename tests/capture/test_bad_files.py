@@ -1,9 +1,8 @@
 """Bad files cause one message that names the file, and nothing else on stderr."""
 
 import builtins
-import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +37,12 @@ def no_warnings(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("no_warnings")
-@pytest.mark.parametrize("size", [0, 8, 9, 60, 100, 200, 1000, -10])
-def test_a_truncated_tiff(folder: Path, size: int) -> None:
+def test_a_truncated_tiff(folder: Path) -> None:
     data = (folder / "2.tif").read_bytes()
-    (folder / "2.tif").write_bytes(data[:size])
-    with pytest.raises(InputError, match=r"2\.tif: (the TIFF is (truncated|damaged)|the file is empty)"):
-        read_capture(folder)
+    for size in (0, 8, 9, 60, 100, 200, 1000, -10):
+        (folder / "2.tif").write_bytes(data[:size])
+        with pytest.raises(InputError, match=r"2\.tif: (the TIFF is (truncated|damaged)|the file is empty)"):
+            read_capture(folder)
 
 
 @pytest.mark.usefixtures("no_warnings")
@@ -60,36 +59,23 @@ def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: b
         read_capture(tmp_path, as_stored=as_stored)
 
 
-@pytest.fixture
-def forbid(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Make a file unreadable, also to root."""
-
-    def forbid_file(path: Path) -> None:
-        path.chmod(0)
-        if os.access(path, os.R_OK):
-            for owner, original in ((Path, Path.open), (builtins, builtins.open)):
-
-                def refuse(file: Any, *args: Any, original: Any = original, **kwargs: Any) -> Any:
-                    if isinstance(file, str | Path) and Path(file) == path:
-                        raise PermissionError(13, "Permission denied", str(file))
-                    return original(file, *args, **kwargs)
-
-                monkeypatch.setattr(owner, "open", refuse)
-
-    return forbid_file
-
-
 @pytest.mark.parametrize(
     "name", ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"]
 )
-def test_a_file_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None], name: str) -> None:
-    if name.endswith(".png"):
-        cv2.imwrite(str(folder / name), np.full((20, 25), 255, np.uint8))
-    elif name.endswith(".npy"):
-        np.save(folder / name, np.broadcast_to([0.0, 0.0, 1.0], (20, 25, 3)))
-    elif name == "light_intensities.txt":
-        np.savetxt(folder / name, np.ones((4, 3)))
-    forbid(folder / name)
+def test_a_file_that_may_not_be_read(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Even root may not."""
+    cv2.imwrite(str(folder / "mask.png"), np.full((20, 25), 255, np.uint8))
+    cv2.imwrite(str(folder / "ambient.png"), np.full((20, 25), 255, np.uint8))
+    np.save(folder / "normals_gt.npy", np.broadcast_to([0.0, 0.0, 1.0], (20, 25, 3)))
+    np.savetxt(folder / "light_intensities.txt", np.ones((4, 3)))
+    for owner, original in ((Path, Path.open), (builtins, builtins.open)):
+
+        def refuse(file: Any, *args: Any, original: Any = original, **kwargs: Any) -> Any:
+            if isinstance(file, str | Path) and Path(file) == folder / name:
+                raise PermissionError(13, "Permission denied", str(file))
+            return original(file, *args, **kwargs)
+
+        monkeypatch.setattr(owner, "open", refuse)
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     assert str(caught.value) == f"{folder / name}: the file cannot be read (Permission denied)."

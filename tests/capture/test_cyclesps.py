@@ -65,11 +65,10 @@ def message(call: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("kind", ["specular", "metallic"])
-def test_every_value_is_what_was_written(tmp_path: Path, kind: str) -> None:
-    written = write_object(tmp_path / "Bunny", "specular", "metallic")[kind]
-    capture = read_capture(tmp_path / f"Bunny/images_{kind}")
-    assert capture.name == f"Bunny_{kind}"
+def test_every_value_is_what_was_written(tmp_path: Path) -> None:
+    written = write_object(tmp_path / "Bunny", "specular", "metallic")["metallic"]
+    capture = read_capture(tmp_path / "Bunny/images_metallic")
+    assert capture.name == "Bunny_metallic"
     inner, rim = boundaries()
     mask = (inner > 0) | (rim > 0)
     assert capture.n_pixels == 35

@@ -1,6 +1,7 @@
 """Light files: every accepted way of writing one, as people have them, and the message for every wrong one."""
 
 import tempfile
+import time
 from pathlib import Path
 
 import cv2
@@ -8,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.io import savemat
 
-from splinecli.capture import find_capture_files, light_files, read_light_directions, read_light_intensities
-from splinecli.capture.formats.numbers import NumberRows, Row
+from splinecli.capture import read_light_directions, read_light_intensities
 from splinecli.capture.light_files import NamedLights, read_lights
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
 ROWS = ["0 0 1", "0.6 0 0.8", "0 -0.6 0.8", "-0.48 0.36 0.8"]
@@ -35,13 +36,21 @@ FORMS = {
     "mixed": "0 0 2\n3,0,4\n0;\t-6e-1; 0.8,\n-0.48\t0.36 , 0.8",
     "transposed": "0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
     "count-transposed": "4\n0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
+    "header": "x y z\n" + "\n".join(ROWS),
+    "units": "Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n",
+    "decimal-commas": "0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8",
+    "commas-and-semicolons": "4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8",
+    "counted-from-1": "1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8",
+    "z-first": "z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48",
+    "y-first": "light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8",
+    "counted-from-0": "no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8",
 }
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_directions(tmp_path: Path, form: str) -> None:
-    for n_images, encoding in ((None, "utf-8"), (4, "utf-8"), (None, "utf-8-sig"), (4, "utf-8-sig")):
-        directions = read_light_directions(write(tmp_path, FORMS[form], encoding), n_images)
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        directions = read_light_directions(write(tmp_path, FORMS[form], encoding), 4)
         assert directions.dtype == np.float64
         np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
@@ -141,28 +150,6 @@ def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
     assert str(caught.value).startswith(f"{path}{message}")
 
 
-IMAGES = tuple(Path(f"img{number}.png") for number in (1, 2, 3, 10))
-
-
-PLAIN = {
-    "header": ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
-    "utf-16": ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
-    "decimal-commas": ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
-    "commas-and-semicolons": ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
-    "counted-from-1": ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
-    "z-first": ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
-    "y-first": ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
-    "counted-from-0": ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
-}
-
-
-@pytest.mark.parametrize("form", PLAIN)
-def test_plain_files(tmp_path: Path, form: str) -> None:
-    text, encoding = PLAIN[form]
-    path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
-    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-15)
-
-
 @pytest.mark.parametrize("n_images", [None, 4])
 def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | None) -> None:
     # The first column, 1 3 2, would count three lights.
@@ -185,35 +172,13 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
 @pytest.mark.parametrize("stem", ["img", "2024_0"])
 def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> None:
     """A name such as 2024_01, which Python would read as a number, is a name."""
-    text = text.replace("img", stem)
-    lights = read_lights(write(tmp_path, text), 4)
+    lights = read_lights(write(tmp_path, text.replace("img", stem)), 4)
     assert isinstance(lights, NamedLights)
-    wanted = [Path(image.name.replace("img", stem)) for image in IMAGES]
+    wanted = [Path(f"{stem}{number}.png") for number in (1, 2, 3, 10)]
     images, how = lights.match(wanted)
     assert how.startswith("name")
     found = dict(zip(images, lights.directions, strict=True))
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
-
-
-@pytest.mark.parametrize("vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"])
-def test_arrays(tmp_path: Path, vectors: np.ndarray) -> None:
-    np.save(tmp_path / "lights.npy", vectors)
-    np.testing.assert_allclose(read_light_directions(tmp_path / "lights.npy", 4), DIRECTIONS, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
-        (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
-        (np.array({"a": 1}, object), "is damaged, or contains no array of numbers"),
-        (np.ones((5, 3)), "found 5 light directions, expected 4"),
-    ],
-)
-def test_refused_arrays(tmp_path: Path, array: np.ndarray, message: str) -> None:
-    np.save(tmp_path / "lights.npy", array, allow_pickle=True)
-    with pytest.raises(InputError, match=message):
-        read_light_directions(tmp_path / "lights.npy", 4)
 
 
 @pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
@@ -224,51 +189,100 @@ def test_angles(tmp_path: Path, text: str | None) -> None:
     np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("0 90\n30 45\n120 45\n240 45", "2 columns of angles, expected 3 columns"),
-        ("1 0 90\n2 30 45\n3 120 45\n4 240 45", "a number and two angles, expected 3 columns"),
-        ("0 30 1\n90 40 1\n180 45 1\n270 30 1", "azimuth, elevation and 1, expected x y z.*Leave the third"),
-        ("a.png 0 30\nb.png 90 40\nc.png 180 45", "a name and 2 numbers"),
-    ],
-)
-def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"found {message}.*add --light-format azel"):
-        read_lights(write(tmp_path, text), text.count("\n") + 1)
+ADD_AZEL = ".*add --light-format azel"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("form", "text", "message"),
     [
-        ("30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
-        ("30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
-        ("0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians.*57.2958"),
-        ("azimuth zenith\n30 45\n120 40\n240 45", r':1: found the column "zenith".*90 minus the angle'),
-        ("0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
+        ("xyz", "0 90\n30 45\n120 45\n240 45", f"2 columns of angles, expected 3 columns{ADD_AZEL}"),
+        ("xyz", "1 0 90\n2 30 45\n3 120 45\n4 240 45", f"a number and two angles, expected 3 columns{ADD_AZEL}"),
+        ("xyz", "0 30 1\n90 40 1\n180 45 1\n270 30 1", f"and 1, expected x y z.*Leave the third{ADD_AZEL}"),
+        ("xyz", "a.png 0 30\nb.png 90 40\nc.png 180 45", f"a name and 2 numbers{ADD_AZEL}"),
+        ("azel", "30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
+        ("azel", "30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
+        ("azel", "0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians.*57.2958"),
+        ("azel", "azimuth zenith\n30 45\n120 40\n240 45", r':1: found the column "zenith".*90 minus the angle'),
+        ("azel", "0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
+        ("slant-tilt", "30 45\n100 100", ":2: found slant 100 and tilt 100, expected"),
     ],
 )
-def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
+def test_angles_and_vectors_are_not_mistaken_for_each_other(tmp_path, form, text, message):
     with pytest.raises(InputError, match=message):
-        read_light_directions(write(tmp_path, text), form="azel")
+        read_lights(write(tmp_path, text), text.count("\n") + 1, form=form)
 
 
-def test_a_format_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Finding, reading, messages and help of a new format follow from its row."""
+def write_opencv(path: Path, **matrices: np.ndarray) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, matrix in matrices.items():
+        storage.write(name, np.ascontiguousarray(matrix, np.float64))
+    storage.release()
+    return path
 
-    def read(path: Path, n_images: int | None, form: str) -> NumberRows:
-        numbers = [float(word) for word in path.read_text().split("|")]
-        return NumberRows(path, tuple(Row(tuple(numbers[at : at + 3]), None) for at in range(0, len(numbers), 3)))
 
-    row = light_files.LightFormat("bars", (".bars",), read, ("*.bars",), 2)
-    monkeypatch.setattr(light_files, "FORMATS", (*light_files.FORMATS, row))
-    for image in IMAGES:
-        (tmp_path / image.name).touch()
-    with pytest.raises(InputError, match=r"no light file \(.*, \*\.bars or light_positions\.txt\)"):
-        find_capture_files(tmp_path)
-    lights = write(tmp_path, "|".join(map(str, DIRECTIONS.ravel()))).rename(tmp_path / "a.bars")
-    assert find_capture_files(tmp_path).light_directions == lights
-    np.testing.assert_allclose(read_lights(lights, 4), DIRECTIONS, atol=1e-15)
-    assert light_files.light_suffixes().endswith(", .bars")
-    with pytest.raises(UsageError, match=r"type \.bars are only read\. Write \.txt, \.npy, \.lp or \.csv"):
-        light_files.check_writable(lights)
+@pytest.mark.parametrize("suffix", [".npy", ".yml", ".yaml", ".xml", ".mat", "packed.mat"])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_arrays(tmp_path: Path, suffix: str, transposed: bool) -> None:
+    """Written by NumPy, OpenCV and SciPy themselves."""
+    stored, path = 5 * (DIRECTIONS.T if transposed else DIRECTIONS).astype(np.float32), tmp_path / f"lights{suffix}"
+    if suffix == ".npy":
+        np.save(path, stored)
+    elif "mat" in suffix:
+        others = {"mu": np.ones((4, 1)), "name": "rig", "K": np.eye(3)}
+        savemat(path, {"Dir": stored, **others}, do_compression=suffix != ".mat")
+    else:
+        write_opencv(path, camera=np.eye(3), lights=stored)
+    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-7)
+
+
+def test_refused_arrays(tmp_path: Path) -> None:
+    for array, message in (
+        (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
+        (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
+        (np.array({"a": 1}, object), "is damaged, or contains no array of numbers"),
+        (np.ones((5, 3)), "found 5 light directions, expected 4"),
+    ):
+        np.save(tmp_path / "lights.npy", array, allow_pickle=True)
+        with pytest.raises(InputError, match=message):
+            read_light_directions(tmp_path / "lights.npy", 4)
+    savemat(tmp_path / "leds.mat", {"Dir": DIRECTIONS.T, "S": DIRECTIONS})
+    with pytest.raises(InputError, match=r"several matrices N x 3 or 3 x N: Dir \(3 x 4\), S \(4 x 3\)"):
+        read_light_directions(tmp_path / "leds.mat", 4)
+    with pytest.raises(InputError, match=r"no matrix N x 3 or 3 x N: K \(2 x 2\)"):
+        read_light_directions(write_opencv(tmp_path / "k.yml", K=np.eye(2)), 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "problem"),
+    [
+        ("a.yml", b"", "no matrix"),
+        ("a.yml", b"lights: !!opencv-matrix\n rows: 2\n cols: 3\n dt: d\n data: [ 1, 2 ]\n", "is damaged"),
+        ("a.yml", b"lights: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, x, 2 ]\n", "is damaged"),
+        ("a.yml", b"l: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, .Nan, 2 ]\n", "damaged"),
+        ("a.xml", b"<?xml version='1.0'?><opencv_storage></opencv_storage>", "no matrix"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(300), "is damaged|no matrix"),
+        ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(300), "7.3 file, which is not supported"),
+    ],
+)
+def test_damaged_matrices(tmp_path: Path, name: str, content: bytes, problem: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=problem):
+        read_light_directions(tmp_path / name, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "unit"),
+    [
+        ("a.yml", "", "\n"),
+        ("a.yml", "lights: ", "\n"),
+        ("a.yml", "lights: !!opencv-matrix", " \n"),
+        ("a.yml", "", "l: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1\n"),
+        ("a.xml", "", '<l type_id="opencv-matrix"><rows>1</rows><cols>3</cols><dt>d</dt><data>1'),
+    ],
+)
+def test_the_time_of_a_file_does_not_grow_with_the_square_of_its_length(tmp_path, name, start, unit):
+    (tmp_path / name).write_text(start + unit * (900_000 // len(unit)))
+    started = time.process_time()
+    with pytest.raises(InputError, match="no matrix"):
+        read_light_directions(tmp_path / name, 3)
+    assert time.process_time() - started < 3  # the square took minutes to hours

@@ -40,28 +40,21 @@ def expected(photographs: NDArray[np.uint16], intensities: NDArray[np.float64]) 
     return np.asarray((photographs / 65535 / intensities[:, None, None]).mean(axis=-1).reshape(len(photographs), -1).T)
 
 
-def test_without_intensities_and_mask(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
+def test_observations_mask_and_ground_truth(capture_folder, write_image, photographs):
     capture = read_capture(capture_folder)
     np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6)
     assert capture.observations.dtype == np.float32
     assert (capture.name, capture.light_indices, capture.ground_truth) == ("vase", (0, 1, 2, 3), None)
     assert (capture.warnings, capture.mask.shape, capture.mask.all()) == ((), (5, 6), True)
     np.testing.assert_allclose(capture.light_directions, LIGHTS)
-
-
-def test_channels_are_divided_by_their_own_intensity(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
     np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
-    np.testing.assert_allclose(read_capture(capture_folder).observations, expected(photographs, INTENSITIES), rtol=1e-6)
-
-
-def test_mask_and_ground_truth(capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> None:
     mask = np.random.default_rng(4).random((5, 6)) < 0.5
     write_image("vase/mask.png", mask.astype(np.uint8) * 255)
     normals = np.broadcast_to([0.0, 0.6, 0.8], (5, 6, 3))
     np.save(capture_folder / "normals_gt.npy", normals)
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.mask, mask)
-    np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3)))[mask.ravel()], rtol=1e-6)
+    np.testing.assert_allclose(capture.observations, expected(photographs, INTENSITIES)[mask.ravel()], rtol=1e-6)
     np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
 
 
@@ -103,18 +96,15 @@ def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
         "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
         "The images have 8 bits; 16-bit linear images give better normals.",
     )
-
-
-@pytest.mark.parametrize(("n_black", "share"), [(1, None), (2, "2.0"), (100, "100.0")])
-def test_pixels_that_no_light_reaches(capture_folder, write_image, n_black, share):
-    for number in range(8, 12):
-        pixels = np.full((10, 10), 1, np.uint16)
-        pixels.flat[:n_black] = 0
-        pixels[9, 9] = number == 8 and n_black < 100  # lit once: not black
-        write_image(f"vase/img{number}.png", pixels)
-    found = texts(read_capture(capture_folder).warnings)
-    assert len(found) == (share is not None)
-    assert all(text.startswith(f"{share} % of the pixels are black under every light") for text in found)
+    for n_black, share in ((1, None), (2, "2.0"), (100, "100.0")):
+        for number in range(8, 12):
+            pixels = np.full((10, 10), 1, np.uint16)
+            pixels.flat[:n_black] = 0
+            pixels[9, 9] = number == 8 and n_black < 100  # lit once: not black
+            write_image(f"vase/img{number}.png", pixels)
+        found = texts(read_capture(capture_folder).warnings)
+        assert len(found) == (share is not None)
+        assert all(text.startswith(f"{share} % of the pixels are black under every light") for text in found)
 
 
 @pytest.mark.parametrize(

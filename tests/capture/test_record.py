@@ -17,17 +17,14 @@ def make(**changes: Any) -> Capture:
     return Capture(**(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes))
 
 
-@pytest.mark.parametrize(
-    ("positions", "message"),
-    [
+def test_positions_that_cannot_be_meant() -> None:
+    for positions, message in (
         ([0, 1, -1], "light index -1 is out of range"),
-        ([0, 1, 2, 1], "light index 1 comes twice. Name each light once."),
+        ([0, 1, 2, 1], "light index 1 is listed twice. Name each light once."),
         ([0, 1], "2 lights chosen, expected at least 3."),
-    ],
-)
-def test_positions_that_cannot_be_meant(positions: list[int], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        make().choose_lights(positions)
+    ):
+        with pytest.raises(UsageError, match=message):
+            make().choose_lights(positions)
 
 
 NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"

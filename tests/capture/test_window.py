@@ -3,10 +3,12 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
 from splinecli.capture.linearise import Window, parse_window
@@ -14,12 +16,19 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.inference import lighting_on
 from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
 from splinecli.surface.pixel_grid import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
+
+
+def on_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
+    """Return the map (H, W, C) of the values (P, C) of a mask (H, W)."""
+    image = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
+    image[mask] = values
+    return image
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
@@ -29,10 +38,11 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     part = open_capture(MEDALLION, window=window).read(as_stored=True)
     np.testing.assert_array_equal(part.mask, window.of(whole.mask))
     np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
-    image = np.zeros((*whole.mask.shape, whole.n_lights), np.float32)
-    image[whole.mask] = whole.observations
     # Sums over the colours may round differently.
-    np.testing.assert_allclose(part.observations, window.of(image)[part.mask], rtol=1e-6)
+    expected = window.of(on_image(whole.mask, whole.observations))[part.mask]
+    np.testing.assert_allclose(part.observations, expected, rtol=1e-6)
+    described = describe_capture(MEDALLION, InferOptions(crop=crop, scale=scale))
+    assert (described["n_pixels"], described["reads"]) == (part.n_pixels, window.in_words())
 
 
 def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
@@ -49,9 +59,7 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
     for crop, scale in ((None, None), WINDOWS[2]):
         options = InferOptions(method="ls", crop=crop, scale=scale, flat_field=str(flats))
         capture = options.open(folder).read(as_stored=True)
-        image = np.zeros((*capture.mask.shape, capture.n_lights), np.float32)
-        image[capture.mask] = capture.observations
-        maps.append(image)
+        maps.append(on_image(capture.mask, capture.observations))
     part = parse_window(*WINDOWS[2]).of(maps[0])
     # The flat field is divided by its mean over the pixels that are read.
     ratio = maps[1][part > 0] / part[part > 0]
@@ -72,13 +80,9 @@ def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str |
         np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
 
 
-def test_info_counts_what_is_read() -> None:
-    crop, scale = WINDOWS[2]
-    part = describe_capture(MEDALLION, InferOptions(crop=crop, scale=scale))
-    expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
-    assert part["n_pixels"] == expected
-    assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
-    assert describe_capture(MEDALLION)["reads"] is None
+def test_windows_in_words() -> None:
+    assert parse_window(*WINDOWS[2]).in_words() == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
 @pytest.mark.parametrize(
@@ -93,7 +97,7 @@ def test_info_counts_what_is_read() -> None:
     ],
 )
 def test_values_that_mean_nothing_are_refused(crop: str | None, scale: str | None, problem: str) -> None:
-    with pytest.raises(UsageError, match=problem.replace("?", r"\?")):
+    with pytest.raises(UsageError, match=problem):
         InferOptions(crop=crop, scale=scale)
 
 
@@ -105,40 +109,26 @@ def test_windows_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-@pytest.mark.parametrize("perspective", [False, True])
-def test_near_lamps_light_a_part_as_they_light_the_whole(crop, scale, perspective, tmp_path):
+@pytest.mark.parametrize(("near", "perspective"), [(True, False), (True, True), (False, True)])
+def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, tmp_path):
+    """Under near lamps, and by a near camera."""
     matrix = tmp_path / "camera.txt"
     matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
-    lights = []
-    for options in ((None, None), (crop, scale)):
-        camera = {"light_distance": 40.0, "pixel_size": 0.1, "camera_matrix": str(matrix) if perspective else None}
-        record = InferOptions(crop=options[0], scale=options[1], **camera)
-        capture = record.open(MEDALLION).read(as_stored=True)
-        places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
-        points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
-        lit = PixelLighting.of(capture.observations, replace(capture.lamps, points=points))
-        values = np.concatenate((lit.directions.reshape(len(points), -1), lit.observations), axis=1)
-        image = np.zeros((*capture.mask.shape, values.shape[1]))
-        image[capture.mask] = values
-        lights.append(image)
-    whole, part = lights
-    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-def test_a_near_camera_sees_a_part_as_it_sees_the_whole(crop, scale, tmp_path):
-    matrix = tmp_path / "camera.txt"
-    matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
+    lamps = {"light_distance": 40.0, "pixel_size": 0.1} if near else {}
     images = []
     for options in ((None, None), (crop, scale)):
-        record = InferOptions(crop=options[0], scale=options[1], camera_matrix=str(matrix))
+        camera = str(matrix) if perspective else None
+        record = InferOptions(crop=options[0], scale=options[1], camera_matrix=camera, **lamps)
         capture = record.open(MEDALLION).read(as_stored=True)
-        directions = lighting_on(capture)(None, np.arange(capture.n_pixels)).directions
-        image = np.zeros((*capture.mask.shape, *directions.shape[1:]))
-        image[capture.mask] = directions
-        images.append(image)
+        lit = lighting_on(capture)(None, np.arange(capture.n_pixels)) if not near else None
+        if near:
+            places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
+            points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
+            lit = PixelLighting.of(capture.observations, replace(capture.lamps, points=points))
+        values = (lit.directions.reshape(capture.n_pixels, -1), capture.observations if not near else lit.observations)
+        images.append(on_image(capture.mask, np.concatenate(values, axis=1)))
     whole, part = images
-    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
+    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
 
 
 def test_the_width_of_a_part_is_not_that_of_the_object() -> None:

@@ -7,9 +7,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,6 +24,12 @@ LIGHTS = np.array(
     [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0, -0.5, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1), (0.4, -0.4, 1)]
 )  # fmt: skip
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+
+
+@pytest.fixture(autouse=True)
+def in_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let relative paths begin in a new folder, so that messages hold short paths."""
+    monkeypatch.chdir(tmp_path)
 
 
 def sphere_normals() -> np.ndarray:
@@ -48,15 +54,9 @@ def truth() -> np.ndarray:
 
 
 @pytest.fixture
-def make_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Write captures by name into the working folder, so that messages hold short paths."""
-    monkeypatch.chdir(tmp_path)
-
-    def make(name: str) -> Path:
-        write_capture(tmp_path / name)
-        return Path(name)
-
-    return make
+def make_capture() -> Callable[[str], Path]:
+    """Write captures by name into the working folder."""
+    return lambda name: write_capture(Path(name))
 
 
 @pytest.fixture
@@ -66,18 +66,16 @@ def capture(make_capture: Callable[[str], Path]) -> Path:
 
 
 @pytest.fixture
-def medallion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def medallion() -> Path:
     """A copy of the example, in an empty working folder."""
-    monkeypatch.chdir(tmp_path)
-    return Path(shutil.copytree(EXAMPLE, tmp_path / "medallion"))
+    return Path(shutil.copytree(EXAMPLE, "medallion"))
 
 
 def read_report(folder: Path) -> dict:
     return json.loads((folder / "report.json").read_text("utf-8"))
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     code: int
     out: str
     err: str
@@ -97,6 +95,19 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> C
     def call(*args: object) -> Run:
         code = main([str(arg) for arg in args])
         return Run(code, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def document(run: Callable[..., Run]) -> Callable[..., Any]:
+    """Run a command with --json, which must succeed, and return its document: that of the only capture of `infer`."""
+
+    def call(command: str, *args: object) -> Any:
+        result = run(command, *args, "--json")
+        assert result.code == 0, result.err
+        found = json.loads(result.out)
+        return found[0] if command == "infer" else found
 
     return call
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from scenes import halfway, write_capture
 from splinecli.capture import read_light_directions
@@ -38,11 +37,6 @@ def write_gray(folder: Path, intensities) -> Path:
     return write_capture(folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png")
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
 def angles_deg(found, expected=LIGHTS):
     return np.degrees(np.arccos((found * expected).sum(axis=1).clip(-1, 1)))
 
@@ -59,10 +53,9 @@ def test_one_ball(run):
     assert not Path("calibration/light_intensities.txt").exists()
 
 
-def test_an_outline_given_by_the_user(run):
+def test_an_outline_given_by_the_user(document):
     write_balls(Path("ball"))
-    result = run("calibrate", "ball", "--circle", "60,48,40", "--json", "-o", "out")
-    report = json.loads(result.out)
+    report = document("calibrate", "ball", "--circle", "60,48,40", "-o", "out")
     assert report["balls"][0]["circle"] == {
         "x": 60.0, "y": 48.0, "radius": 40.0, "from": "--circle", "seen": 1.0, "spread": 0.0,
     }  # fmt: skip
@@ -148,18 +141,6 @@ def test_refusals(refuse):
     assert not Path("calibration").exists()
 
 
-def test_intensities_of_earlier_lights_are_removed(run):
-    write_balls(Path("ball"))
-    write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])
-    arguments = ["calibrate", "ball", "--circle", "60,48,40", "--overwrite"]
-    result = run(*arguments, "--gray-ball", "gray")
-    assert (result.code, result.out) == (0, "calibration/light_directions.txt\n")
-    assert "The light intensities are in calibration/light_intensities.txt\n" in result.err
-    assert Path("calibration/light_intensities.txt").exists()
-    assert run(*arguments).code == 0
-    assert not Path("calibration/light_intensities.txt").exists()
-
-
 def test_a_display_encoded_target_is_reported(run):
     write_balls(Path("ball"))
     write_gray(Path("gray"), [1.0, 1.0, 1.0, 1.0])
@@ -177,3 +158,7 @@ def test_a_display_encoded_target_is_reported(run):
     assert intensities[0] == intensities[1]
     assert "are read as sRGB. Add --transfer linear" in run(*arguments).err
     assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err
+    assert "The light intensities are in calibration/light_intensities.txt\n" in run(*arguments).err
+    # Those of earlier lights are removed.
+    assert run("calibrate", "ball", "--overwrite").code == 0
+    assert not Path("calibration/light_intensities.txt").exists()

@@ -55,31 +55,9 @@ def test_the_same_file_under_two_lights(run, medallion):
     assert words.removesuffix(" Remove one,") in refused(run, "--method", "ls")
 
 
-def test_two_images_under_the_same_light(run, medallion):
-    lights = np.loadtxt(medallion / "light_directions.txt")
-    lights[1] = lights[0]
-    np.savetxt(medallion / "light_directions.txt", lights)
-    shutil.copy(medallion / "01.png", medallion / "02.png")
-    run("infer", medallion, "--method", "ls")
-    assert "repeated_images" not in codes()
-
-
-def test_a_black_image_is_named_without_intensities(run, medallion):
-    (medallion / "light_intensities.txt").unlink()
-    picture = cv2.imread(str(medallion / "04.png"), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(medallion / "04.png"), 0 * picture)
-    result = run("infer", medallion, "--method", "ls")
-    assert "04.png is black. Its lamp failed." in result.err
-    assert codes() == ["image_inconsistent"]
-
-
 @pytest.mark.parametrize(
     ("signs", "negated", "code"),
-    [
-        ((1, 1, -1), "z", "ground_truth_z"),
-        ((-1, 1, 1), "x", "ground_truth_frame"),
-        ((1, -1, 1), "y", "ground_truth_frame"),
-    ],
+    [((1, 1, -1), "z", "ground_truth_z"), ((1, -1, 1), "y", "ground_truth_frame")],
 )
 def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     (medallion / "normals_gt.png").rename("truth.png")
@@ -94,15 +72,12 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     assert f"degrees with {negated} negated: it is probably in this frame" in evaluation.out + evaluation.err
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [((0.1, 0.1, 1), "The lights lie in a narrow cone"), ((1, 0.05, 1), "The lights lie nearly in one plane")],
-)
-def test_lights_that_crowd(run, medallion, change, words):
-    lights = np.loadtxt(medallion / "light_directions.txt") * change
-    np.savetxt(medallion / "light_directions.txt", lights)
-    for command in (("infer", medallion, "--method", "ls"), ("info", medallion)):
-        assert words in run(*command).err
+def test_lights_that_crowd(run, medallion):
+    given = np.loadtxt(medallion / "light_directions.txt")
+    for change, words in (((0.1, 0.1, 1), "lie in a narrow cone"), ((1, 0.05, 1), "lie nearly in one plane")):
+        np.savetxt(medallion / "light_directions.txt", given * change)
+        assert f"The lights {words}" in run("info", medallion).err
+    run("infer", medallion, "--method", "ls")
     assert "lights_ill_conditioned" in codes()
 
 

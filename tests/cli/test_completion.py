@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -44,14 +45,9 @@ def question(line: str, shell: str) -> dict[str, str]:
 
 def words(out: str, shell: str) -> list[str]:
     """What the line's last word may become; of zsh and fish without the help beside it."""
-    if shell == "bash":
-        return out.split()
-    if shell == "fish":
-        return [entry.split("\t")[0] for entry in out.splitlines() if entry]
-    if out == "_files\n":
-        return []
-    assert out.startswith("_arguments '*: :((")
-    return [entry.split('"')[1] for entry in out.removeprefix("_arguments '*: :((").splitlines()]
+    if shell == "zsh":
+        return re.findall(r'^(?:_arguments \'\*: :\(\()?"(.*?)"', out, re.MULTILINE)
+    return out.split() if shell == "bash" else [entry.split("\t")[0] for entry in out.splitlines() if entry]
 
 
 COMPLETED = {

@@ -31,10 +31,8 @@ def test_files_and_table(dataset, run, golden):
         rows = list(csv.DictReader(file))
     found = [(row["method"], row["capture"], row["trials"]) for row in rows]
     assert found == [("ls", "matte", "3"), ("ls", "shaded", "3")]
-    document = json.loads(Path("evaluation/results.json").read_text())
-    matte, shaded = document["results"]
+    matte, shaded = json.loads(Path("evaluation/results.json").read_text())["results"]
     assert matte["mae_deg"] < 1e-3 < shaded["mae_deg"]
-    assert document["averages"]["ls"] == pytest.approx((matte["mae_deg"] + shaded["mae_deg"]) / 2, abs=1e-4)
 
 
 @pytest.fixture
@@ -52,27 +50,20 @@ def overexposed(make_capture):
 
 @pytest.mark.parametrize("n_lights", ["all", 7])
 @pytest.mark.parametrize("method", ["iw12", "ls"])
-def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lights):
+def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, n_lights):
     """The draw of `infer` is the first of `evaluate`."""
     lights = [] if n_lights == "all" else ["--n-lights", n_lights, "--seed", 3]
     figures = []
     for policy, reading in (([], "restored"), (["--as-stored"], "as stored")):
-        shared = [overexposed, "--method", method, *policy, "--json", "--overwrite"]
-        (report,) = json.loads(run("infer", *shared, *lights).out)
-        document = json.loads(run("evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1).out)
-        (result,) = document["results"]
+        shared = [overexposed, "--method", method, *policy, "--overwrite"]
+        report = document("infer", *shared, *lights)
+        evaluation = document("evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1)
+        (result,) = evaluation["results"]
         assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
-        assert (document["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
+        assert (evaluation["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
         figures.append(result["mae_deg"])
     restored, as_stored = figures
     assert restored < as_stored / 2
-
-
-def test_several_light_counts_and_all(dataset, run, golden):
-    arguments = ["--n-lights", 4, "--n-lights", "all", "--trials", 2, "--max-pixels", 50]
-    result = run("evaluate", dataset, "--method", "ls", *arguments)
-    assert result.code == 0
-    golden("evaluate_several.txt", result.out)
 
 
 def test_a_capture_without_ground_truth_is_skipped(dataset, run, golden):
@@ -177,11 +168,10 @@ def test_all_methods_by_one_word(dataset, run):
     assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
 
 
-def test_the_white_level_is_used_and_named(overexposed, run):
+def test_the_white_level_is_used_and_named(overexposed, document):
     """A level below the image values makes the values above it saturated, so they are restored."""
-    arguments = ["evaluate", overexposed, "--method", "ls", "--n-lights", "all", "--json"]
-    plain = json.loads(run(*arguments).out)
-    lower = json.loads(run(*arguments, "--white-level", 50_000).out)
+    arguments = ["evaluate", overexposed, "--method", "ls", "--n-lights", "all"]
+    plain, lower = document(*arguments), document(*arguments, "--white-level", 50_000)
     assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()

@@ -10,29 +10,12 @@ import pytest
 import tifffile
 from PIL import Image
 
-from splinecli.surface.surface_files import encode_exr
-
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header of an EXR file and its channels, each on its own."""
     library = pytest.importorskip("OpenEXR")
     file = library.File(str(path), separate_channels=True)
     return file.header(), {name: channel.pixels for name, channel in file.channels().items()}
-
-
-@pytest.mark.parametrize("form", [np.float16, np.float32])
-def test_values_and_channels_survive(tmp_path: Path, form: type[np.floating]) -> None:
-    pytest.importorskip("OpenEXR")
-    pixels = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(form)
-    (tmp_path / "rgb.exr").write_bytes(encode_exr(pixels, {"made": "here"}))
-    (tmp_path / "y.exr").write_bytes(encode_exr(pixels[..., 0], {}))
-    header, channels = read(tmp_path / "rgb.exr")
-    assert header["made"] == "here"
-    assert set(channels) == set("RGB")
-    for number, name in enumerate("RGB"):
-        assert channels[name].dtype == form
-        np.testing.assert_array_equal(channels[name], pixels[..., number])
-    np.testing.assert_array_equal(read(tmp_path / "y.exr")[1]["Y"], pixels[..., 0])
 
 
 @pytest.mark.parametrize("convention", ["opengl", "directx"])

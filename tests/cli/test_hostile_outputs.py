@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from splinecli.evaluation.trials import TrialStore
-from splinecli.system.publishing import UNDONE, NewFiles
 from system.test_publishing import LINKS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
@@ -115,28 +114,6 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
             assert everything_but(folder) == before, (taken, call)
 
 
-def test_planted_orders_and_hidden_files(inputs, run):
-    """What earlier versions carried out, and hidden files of the names that the commands make."""
-    Path("victim").write_text("precious")
-    plan = {"remove": ["../victim", "link"], "report": "report.json"}
-    for command, given, _ in COMMANDS.values():
-        if command.startswith("prepare") or given == "sphere":
-            continue
-        hidden = Path(given, ".new.splinecli-complete")
-        (hidden / "files").mkdir(parents=True)
-        (hidden / "plan.json").write_text(json.dumps(plan))
-        (hidden / "files/report.json").write_text("{}")
-        Path(given, "link").symlink_to(Path("victim").absolute())
-        Path(given, ".scene0.splinecli-unfinished").symlink_to(Path("victim").absolute())
-        Path(given, ".0123456789abcdef.splinecli-unfinished").write_text("left")
-        result = run(*command.split())
-        assert (result.code, UNDONE in result.err) == (0, True)
-        assert Path("victim").read_text() == "precious"
-        assert (hidden / "plan.json").exists() and Path(given, "link").is_symlink()
-        assert not Path(given, ".0123456789abcdef.splinecli-unfinished").exists()
-        shutil.rmtree("out", ignore_errors=True)
-
-
 def test_trials_go_on_in_a_file_of_their_own(tmp_path):
     """Neither through a link nor through another name of the same file; whole lines stay."""
     line = json.dumps({"key": "a", "mae_deg": 1.0, "seconds": 1.0, "estimated_intensities": False}) + "\n"
@@ -150,20 +127,6 @@ def test_trials_go_on_in_a_file_of_their_own(tmp_path):
     TrialStore(path)
     assert (path.read_text(), path.is_symlink()) == ("", False)
     assert elsewhere.read_text() == line + line[:20]
-
-
-def test_an_interrupt_at_the_very_end(inputs, run, monkeypatch):
-    publish = NewFiles.publish
-
-    def interrupt(*arguments: object) -> None:
-        publish(*arguments)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(NewFiles, "publish", interrupt)
-    for command, _, _ in COMMANDS.values():
-        result = run(*command.split())
-        assert (result.code, result.err.splitlines()[-1]) == (130, "splinecli: interrupted."), result.err
-        shutil.rmtree("out", ignore_errors=True)
 
 
 def test_something_else_in_place_of_a_lock_fails_its_capture_only(inputs, run):

@@ -12,11 +12,6 @@ from scenes import shade, sphere, spiral_lights, write_capture
 LIGHTS = spiral_lights(10, 55, 12)
 
 
-@pytest.fixture(autouse=True)
-def in_its_own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
 def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Images (F, H, W) from 0 to 1 of a ball before a plane of this brightness, and its mask."""
     normals, mask = sphere(80)

@@ -1,6 +1,5 @@
 """`splinecli import-weights`: the written file works, and refusals."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -21,14 +20,13 @@ def checkpoints(tmp_path_factory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(autouse=True)
-def here(checkpoints, tmp_path, monkeypatch):
+def here(checkpoints):
     """Both checkpoints under short names in the working folder."""
-    monkeypatch.chdir(tmp_path)
     for path in checkpoints:
         Path(path.name).symlink_to(path)
 
 
-def test_imported_weights_run(run, make_capture):
+def test_imported_weights_run(run, document, make_capture):
     result = run("import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors")
     assert (result.code, result.out, result.err) == (0, "new/official.safetensors\n", "")
     assert [path.name for path in Path("new").iterdir()] == ["official.safetensors"]
@@ -36,8 +34,7 @@ def test_imported_weights_run(run, make_capture):
     few[10:14, 10:14] = 255
     cv2.imwrite("few.png", few)
     weights = ("--weights", "new/official.safetensors")
-    result = run("infer", make_capture("sphere"), "--mask", "few.png", *weights, "--json")
-    (report,) = json.loads(result.out)
+    report = document("infer", make_capture("sphere"), "--mask", "few.png", *weights)
     assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
     quiet = run("import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors", "--overwrite", "-q")
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")

@@ -11,15 +11,10 @@ from PIL import Image
 from scenes import spiral_lights
 
 
-def files_below(folder: Path) -> list[str]:
-    return sorted(str(path) for path in folder.rglob("*"))
-
-
 def test_the_report_of_a_capture(run, capture):
-    before = files_below(capture.parent)
-    result = run("info", str(capture))
-    assert files_below(capture.parent) == before
-    assert result.code == 0
+    before = sorted(Path().rglob("*"))
+    result = run("info", capture)
+    assert (result.code, sorted(Path().rglob("*"))) == (0, before)
     rows = {line[:13].strip(): line[13:] for line in result.out.splitlines()}
     assert rows["capture"] == f"{capture.name} (plain folder)"
     assert rows["images"] == "8 (image1.png ... image8.png): 24 x 24, gray, 16 bits"
@@ -30,8 +25,8 @@ def test_the_report_of_a_capture(run, capture):
     assert rows["white level"] == "65535, the full scale of the files"
 
 
-def test_the_same_as_json(run, capture):
-    report = json.loads(run("info", str(capture), "--json").out)
+def test_the_same_as_json(document, capture):
+    report = document("info", capture)
     assert report["image_kinds"] == [{"size": [24, 24], "channels": 1, "type": "uint16"}]
     assert report["axis_angle_deg"] == [0.0, 29.5]
     assert report["light_intensities"] is None
@@ -43,33 +38,24 @@ def test_the_same_as_json(run, capture):
     ]
 
 
-def test_the_camera_of_exif(run, tmp_path):
+def test_the_camera_of_exif(run, document):
     """A lens of 50 mm on film of 43.3 mm across the diagonal, before 36 x 24 mm in 360 x 240 pixels."""
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 50
-    (tmp_path / "photographs").mkdir()
+    Path("photographs").mkdir()
     for number in range(4):
-        Image.new("L", (360, 240), 40 + 20 * number).save(tmp_path / f"photographs/{number}.jpg", exif=exif)
-    np.savetxt(tmp_path / "photographs/light_directions.txt", spiral_lights(4))
-    report = json.loads(run("info", tmp_path / "photographs", "--json").out)
+        Image.new("L", (360, 240), 40 + 20 * number).save(f"photographs/{number}.jpg", exif=exif)
+    np.savetxt("photographs/light_directions.txt", spiral_lights(4))
+    report = document("info", "photographs")
     assert report["camera_matrix"] is None
     assert report["exif_camera_matrix"] == [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]]
     words = "counts as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500 119.5, 0 0 1"
-    assert f"camera       {words}" in run("info", tmp_path / "photographs").out
+    assert f"camera       {words}" in run("info", "photographs").out
 
 
-def test_a_part_of_the_pixels_gives_the_same_report(run, capture, monkeypatch):
-    """As of large images."""
-    whole = json.loads(run("info", capture, "--json").out)
-    monkeypatch.setattr("splinecli.diagnosis.summary._ENOUGH", 400)
-    sampled = json.loads(run("info", capture, "--json").out)
-    assert sampled["exposure"].pop("bright") == pytest.approx(whole["exposure"].pop("bright"), rel=0.02)
-    assert sampled == whole
-
-
-def test_the_plot_of_the_lights(run, capture, tmp_path):
-    assert run("info", str(capture), "--plot", tmp_path / "sky.png", "-q").code == 0
-    picture = cv2.imread(str(tmp_path / "sky.png"))
+def test_the_plot_of_the_lights(run, capture):
+    assert run("info", capture, "--plot", "sky.png", "-q").code == 0
+    picture = cv2.imread("sky.png")
     orange = (np.abs(picture.astype(int) - (0x00, 0x5E, 0xD5)).sum(axis=2) < 20).sum()
     assert orange > 8 * 20  # eight markers
 
@@ -88,40 +74,34 @@ def test_warnings(run, capture):
     assert (result.code, "image4.png: found an image of 24 x 20 pixels, expected 24 x 24" in result.err) == (3, True)
 
 
-def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
-    before = (capture / "image1.png").read_bytes()
+def test_the_plot_replaces_no_photograph(run, capture):
     for name in ("image1.png", "sky.png"):
         result = run("info", capture, "--plot", capture / name)
         assert (result.code, "would be in the folder of the images" in result.err) == (2, True)
-    assert (capture / "image1.png").read_bytes() == before
-    (tmp_path / "mine.png").write_bytes(b"mine")
-    assert run("info", capture, "--plot", tmp_path / "mine.png").code == 5
-    assert (tmp_path / "mine.png").read_bytes() == b"mine"
-    assert run("info", capture, "--plot", tmp_path / "mine.png", "--overwrite").code == 0
+    Path("mine.png").write_bytes(b"mine")
+    assert run("info", capture, "--plot", "mine.png").code == 5
+    assert Path("mine.png").read_bytes() == b"mine"
+    assert run("info", capture, "--plot", "mine.png", "--overwrite").code == 0
 
 
-def test_the_white_level_of_12_bit_data(run, capture):
+def test_the_white_level_of_12_bit_data(run, document, capture):
     """Clipped at 4095, no value reaches the full scale of the files, and yet many are saturated."""
     for path in capture.glob("image*.png"):
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
         cv2.imwrite(str(path), np.minimum(stored * 1.2 / 16, 4095).astype(np.uint16))
-    result = run("info", capture)
-    assert "white level  4095, found in the images\n" in result.out
-    report = json.loads(run("info", capture, "--json").out)
-    assert report["white_level"] == {"value": 4095, "origin": "images"}
+    assert "white level  4095, found in the images\n" in run("info", capture).out
+    report = document("info", capture)
     mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
     shares = [(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean() for path in capture.glob("image*.png")]
-    assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
-    assert report["exposure"]["saturated"] > 0.1
+    assert max(shares) > 0.1 and report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
     assert report["exposure"]["bright"][1] == pytest.approx(1)
 
 
-def test_auto_mask(run, capture):
+def test_auto_mask(document, capture):
     (capture / "mask.png").unlink()
     for path in capture.glob("image*.png"):
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         stored[:, :8] = 0
         cv2.imwrite(str(path), stored)
-    result = run("info", capture, "--auto-mask", "--json")
-    report = json.loads(result.out)
-    assert (result.code, report["mask"], report["n_pixels"]) == (0, "found in the images", 24 * 16)
+    report = document("info", capture, "--auto-mask")
+    assert (report["mask"], report["n_pixels"]) == ("found in the images", 24 * 16)

@@ -2,15 +2,12 @@
 
 import json
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from cli.conftest import COMMAND, read_report
-from splinecli.cli.main import app
+from cli.conftest import read_report
 from splinecli.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
@@ -55,17 +52,6 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
 def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
     path.write_text(path.read_text().replace(old, new, 1))
     return ()
-
-
-def test_what_changed_is_named_by_options_that_exist(capture, run, monkeypatch):
-    """Here all of them: no option is as in the report."""
-    assert run("infer", capture, "--method", "ls", "--maps", "relief,curvature").code == 0
-    other = run("infer", capture, "--method", "ls", "--maps", "relief:3,curvature:0.2")
-    assert (other.code, "made with another --maps. Add --update" in other.err) == (5, True)
-    monkeypatch.setattr(InferOptions, "from_dict", lambda values: SimpleNamespace(**dict.fromkeys(values, "another")))
-    named = set(re.findall(r"--[a-z-]+", run("infer", capture, "--method", "ls").err.split(")")[0]))
-    known = {name for parameter in COMMAND(app).commands["infer"].params for name in parameter.opts}
-    assert len(named) > 20 and named <= known
 
 
 CHANGES = {
@@ -126,20 +112,18 @@ UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
 def test_an_unfinished_folder_is_computed_again(capture, run, name):
     call = ("infer", capture, "--method", "ls")
     assert run(*call).code == 0
-    whole = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}
+    whole = {path.name for path in Path("out/sphere").iterdir()}
     file, damage, reason = UNFINISHED_FOLDERS[name]
     damage(Path("out/sphere", file))
-    elsewhere = Path("elsewhere").read_bytes() if Path("elsewhere").exists() else None
+    elsewhere = {path: path.read_bytes() for path in Path().glob("elsewhere")}
     again = run(*call)
     assert (again.code, again.out[:11]) == (0, "out/sphere:")
-    assert reason in again.err
-    assert "so it is computed again" in again.err
-    assert {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}.keys() == whole.keys()
+    assert reason in again.err and "so it is computed again" in again.err
+    assert {path.name for path in Path("out/sphere").iterdir()} == whole
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
-    assert elsewhere in (None, Path("elsewhere").read_bytes() if elsewhere else b"")
-    report = read_report(Path("out/sphere"))
+    assert {path: path.read_bytes() for path in elsewhere} == elsewhere
     sizes = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"}
-    assert report["file_sizes"] == sizes
+    assert read_report(Path("out/sphere"))["file_sizes"] == sizes
     assert "already done, skipped" in run(*call).err
 
 

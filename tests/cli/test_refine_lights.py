@@ -10,9 +10,8 @@ from scenes import BUMP_LAMPS, write_bump
 
 
 @pytest.fixture
-def rough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+def rough() -> np.ndarray:
     """Write a matte bump under distant lights. Returns directions (7, 3) with errors of about 5 degrees."""
-    monkeypatch.chdir(tmp_path)
     write_bump(Path("bump"), distant=True)
     directions = BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
     Path("bump/light_intensities.txt").write_text("1\n" * len(directions))
@@ -21,13 +20,9 @@ def rough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
     return rough / np.linalg.norm(rough, axis=1, keepdims=True)
 
 
-def test_infer(run, rough: np.ndarray) -> None:
-    reports = []
-    for more in ((), ("--refine-lights",)):
-        result = run("infer", "bump", "--method", "ls", "--json", "--overwrite", *more)
-        assert result.code == 0, result.err
-        reports.append(json.loads(result.out)[0])
-    given, refined = reports
+def test_infer(document, rough: np.ndarray) -> None:
+    command = ("infer", "bump", "--method", "ls", "--overwrite")
+    given, refined = (document(*command, *more) for more in ((), ("--refine-lights",)))
     np.testing.assert_allclose(given["light_directions"], rough, atol=1e-5)
     moved = np.degrees(np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1)))
     assert 1 < moved.mean() < 10
@@ -36,15 +31,13 @@ def test_infer(run, rough: np.ndarray) -> None:
     assert refined["angular_error_deg"]["mean"] < 0.9 * given["angular_error_deg"]["mean"]
 
 
-def test_evaluate(run, rough: np.ndarray) -> None:
+def test_evaluate(document, rough: np.ndarray) -> None:
     """Both protocols share a folder: trials with refined lights are other trials."""
-    errors = []
-    for more in ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3")):
-        result = run("evaluate", "bump", "--method", "ls", "--n-lights", "all", "--json", "-o", "scores", *more)
-        assert result.code == 0, result.err
-        document = json.loads(result.out)
-        errors.append(document["results"][0]["mae_deg"])
-    assert document["protocol"]["light_error_deg"] == 3
+    command = ("evaluate", "bump", "--method", "ls", "--n-lights", "all", "-o", "scores")
+    options = ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3"))
+    found = [document(*command, *more) for more in options]
+    errors = [one["results"][0]["mae_deg"] for one in found]
+    assert found[2]["protocol"]["light_error_deg"] == 3
     assert errors[1] < 0.9 * errors[0]
     assert errors[2] not in errors[:2]
 

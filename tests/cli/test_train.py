@@ -16,7 +16,7 @@ from splinecli.training.run_files import RunLog
 
 
 @pytest.fixture(autouse=True)
-def small_runs(tmp_path, monkeypatch):
+def small_runs(monkeypatch):
     """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, tasks
@@ -24,17 +24,14 @@ def small_runs(tmp_path, monkeypatch):
     tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
-    monkeypatch.chdir(tmp_path)
 
 
-def rows() -> list[dict[str, str]]:
+def steps() -> list[str]:
     with Path("run/metrics.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+        return [row["step"] for row in csv.DictReader(file)]
 
 
-FILES = {
-    "weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv", "curves.png", "maps.png",
-}  # fmt: skip
+SAVED = {"weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv"}
 
 
 def settings() -> dict[str, Any]:
@@ -56,13 +53,13 @@ def test_a_run_and_its_continuation(run, monkeypatch):
     result = run("train", "-o", "run", "--steps", 3)
     assert (result.code, result.out) == (0, "run/weights.safetensors\n")
     assert "step 3, 48 pixels" in result.err
-    assert {path.name for path in Path("run").iterdir()} == FILES
+    assert {path.name for path in Path("run").iterdir()} == SAVED | {"curves.png", "maps.png"}
     assert settings()["steps"] == 3
     assert settings()["sources"] == {"generator": 1.0}
-    assert [row["step"] for row in rows()] == ["3"]
+    assert steps() == ["3"]
     monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet") == type(result)(0, "", "")
-    assert [row["step"] for row in rows()] == ["3", "5"]
+    assert steps() == ["3", "5"]
     # A name that is not UTF-8, which the library of the weights does not take.
     other = os.fsdecode(b"r\xffn")
     try:
@@ -74,21 +71,21 @@ def test_a_run_and_its_continuation(run, monkeypatch):
     # Settings may be repeated if they are those of the run.
     again = ["--resume", "--steps", 6, "--preset", "compact", "--seed", 0, "--quiet"]
     assert run("train", "-o", "run", *again).code == 0
-    assert [row["step"] for row in rows()] == ["3", "5", "6"]
+    assert steps() == ["3", "5", "6"]
 
 
-def test_a_run_on_pixel_sets(run, no_pictures, make_capture):
+def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     write_set("set")
     write_set("more/set")
     result = run("train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5)
     assert result.code == 0, result.err
-    assert {path.name for path in Path("run").iterdir()} == FILES - {"curves.png", "maps.png"}
+    assert {path.name for path in Path("run").iterdir()} == SAVED
     values = settings()
     # A run continues from another working folder.
     assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
-    (report,) = json.loads(run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out)
+    report = document("infer", make_capture("sphere"), "--weights", "run/weights.safetensors")
     assert report["angular_error_deg"]["mean"] < 10
     # First from the same folder, then from another.
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0
@@ -134,7 +131,7 @@ def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
     monkeypatch.setattr("splinecli.training.loop.restarts_are_allowed", lambda: True)
     assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
-    assert [row["step"] for row in rows()] == ["3", "5"]
+    assert steps() == ["3", "5"]
     # Without a checkpoint, a run starts.
     assert run("train", "-o", "other", "--steps", 1, "--quiet").code == 0
 
@@ -160,7 +157,7 @@ def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
     assert result.code == 0
     assert "splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv" in result.err
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
-    assert [row["step"] for row in rows()] == ["2"]
+    assert steps() == ["2"]
 
 
 def test_refusals(run, refuse, no_pictures):
@@ -205,4 +202,4 @@ def test_refusals(run, refuse, no_pictures):
     )
     refuse("train", cases, "train_refusals.txt")
     assert not Path("other").exists()
-    assert [row["step"] for row in rows()] == ["1"]
+    assert steps() == ["1"]

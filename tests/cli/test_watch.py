@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -13,12 +14,8 @@ from splinecli.cli import infer as watch
 def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_capture, monkeypatch) -> None:
     """Something happens at each look at the folder; then Ctrl-C."""
     parts = Path("parts")
-    parts.mkdir()
-    (parts / "bad").mkdir()
+    (parts / "bad").mkdir(parents=True)
     (parts / "bad/done").touch()
-
-    def copy_first() -> None:
-        shutil.copytree(capture, parts / "-first 1")
 
     def look(steps: list) -> None:
         def sleep(seconds: float) -> None:
@@ -30,7 +27,8 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
 
     # Meanwhile, the folder is away for two looks.
     steps = [lambda: parts.rename("away"), lambda: None, lambda: Path("away").rename(parts)]
-    look([*steps, copy_first, lambda: (parts / "-first 1/done").touch()])
+    copy = partial(shutil.copytree, capture, parts / "-first 1")
+    look([*steps, copy, lambda: (parts / "-first 1/done").touch()])
     command = ("watch", parts, "--marker", "done", "--", "--method", "ls", "--jsonl", "-o", "out")
     result = run(*command)
     assert result.code == 130

@@ -49,25 +49,17 @@ def test_strict_writes_nothing_and_ends_with_3(run, medallion):
 
 
 @pytest.mark.parametrize("options", [(), ("--intensities", "equal")])
-@pytest.mark.parametrize(
-    ("order", "words"),
-    [
-        (np.roll(np.arange(10), 1), "if image 1 belongs to light 2, image 2 to the next, and so on"),
-        (np.arange(10)[::-1], "in reversed order, beginning with light 10"),
-        (np.r_[0, 5, 2:5, 1, 6:10], "with those of 02.png and 06.png exchanged"),
-    ],
-    ids=["shifted", "reversed", "exchanged"],
-)
-def test_orders_are_named_although_the_intensities_are_unequal_and_unknown(run, medallion, order, words, options):
+def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(run, medallion, options):
     (medallion / "light_intensities.txt").unlink()
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
         cv2.imwrite(path, np.rint(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)).astype(np.uint16))
     for command in (("info", medallion), ("infer", medallion, "--method", "ls")):
         assert "light" not in run(*command, *options).err.replace("The light intensities were estimated", "")
-    write_lights(medallion, lambda lights: lights[order])
+    write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
     for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):
-        assert f"much better {words} (misfit" in run(*command, *options).err
+        found = run(*command, *options).err
+        assert "much better with those of 02.png and 06.png exchanged (misfit" in found
 
 
 def test_info_lists_the_readings(run, medallion):
@@ -168,14 +160,3 @@ def test_an_image_that_contradicts_the_others_is_named(run, medallion):
     assert "07.png contradicts the other images and is 0.4" in report["warnings"][0]
     left_out = ",".join(str(place) for place in range(10) if place != 6)
     assert run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0
-
-
-def test_refinement_is_suggested_for_rough_lights(run, medallion):
-    noise = np.random.default_rng(1).normal(0, 0.07, (10, 3))
-    write_lights(medallion, lambda lights: lights + noise)
-    assert json.loads(run("info", medallion, "--json").out)["warning_codes"] == ["rough_lights"]
-    result = run("infer", medallion, "--method", "ls", "--strict")  # it is no error
-    assert result.code == 0
-    assert "degrees away on average, leave" in result.err and "Try --refine-lights." in result.err
-    refined = run("infer", medallion, "--method", "ls", "--refine-lights", "--overwrite", "--json")
-    assert [warning["code"] for warning in json.loads(refined.out)[0]["warnings"]] == ["refined_lights"]

@@ -1,5 +1,6 @@
 """Wrong light files are told from right ones, on surfaces whose normals are known."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,10 @@ from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 SIZE = 64
-
-
 SHIFTED = "if image 1 belongs to light 2, image 2 to the next, and so on"
-
-
-def ring(count: int) -> Array:
-    return ring_lights(count, 40, 0.3)
+ring = partial(ring_lights, zenith_deg=40, first_rad=0.3)
+# Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise
+shade = partial(scenes.shade, gloss=0.3, noise=0.01)
 
 
 def scattered(count: int = 14) -> Array:
@@ -43,14 +41,9 @@ def vase() -> tuple[Array, NDArray[np.bool_]]:
     return unit(np.stack((-z_x, z_row, np.ones_like(z)), axis=2))[inside], inside
 
 
-def shade(normals: Array, lights: Array) -> Array:
-    """Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise."""
-    return scenes.shade(normals, lights, gloss=0.3, noise=0.01)
-
-
-def check_vase(lights: Array, read_as: Array) -> LightCheck:
+def check_vase(lights: Array, read_as: Array, gloss: float = 0.3) -> LightCheck:
     normals, mask = vase()
-    return check_lights(shade(normals, lights), mask, read_as)
+    return check_lights(scenes.shade(normals, lights, gloss=gloss, noise=0.01), mask, read_as)
 
 
 @pytest.mark.parametrize("lights", [scattered(), scattered(6), ring(8), ring(12)], ids=len)
@@ -79,7 +72,7 @@ ORDERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["shifted", "reversed", "swapped", "shuffled"])
+@pytest.mark.parametrize("name", list(ORDERS)[1:])
 def test_each_wrong_order_is_named(name: str) -> None:
     order, words = ORDERS[name]
     check = check_vase(scattered(), scattered()[order])
@@ -170,7 +163,7 @@ def test_real_captures(shared_data: Path, name: str) -> None:
     capture = read_capture(shared_data / name, light_indices=chosen)
     lights = capture.light_directions
     right = check_lights(capture.observations, capture.mask, lights)
-    assert (right.order, right.best) == (None, None)
+    assert (right.order, right.best, right.odd_image) == (None, None, None)
     flipped = check_lights(capture.observations, capture.mask, lights * (1, -1, 1))
     assert flipped.best is not None and str(flipped.best.frame) == "y-down"
 
@@ -213,9 +206,7 @@ def test_rings_that_begin_at_another_lamp(counts: tuple[int, ...], frame: tuple[
 
 def test_a_ring_that_runs_the_other_way_round() -> None:
     lights = dome(12, 12, 12)
-    read_as = lights.copy()
-    read_as[12:24] = lights[12:24][::-1]
-    check = check_vase(lights, read_as)
+    check = check_vase(lights, np.concatenate((lights[:12], lights[12:24][::-1], lights[24:])))
     assert check.order == "with lights 13 to 24 reversed"
     np.testing.assert_allclose(check.mended, lights, atol=1e-6)
 
@@ -223,7 +214,5 @@ def test_a_ring_that_runs_the_other_way_round() -> None:
 @pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
 @pytest.mark.parametrize("gloss", [0.0, 0.3, 0.8])
 def test_right_rings_are_not_doubted(counts: tuple[int, ...], gloss: float) -> None:
-    lights = dome(*counts)
-    normals, mask = vase()
-    check = check_lights(scenes.shade(normals, lights, gloss=gloss, noise=0.01), mask, lights)
+    check = check_vase(dome(*counts), dome(*counts), gloss)
     assert (check.order, check.best, check.mended) == (None, None, None)

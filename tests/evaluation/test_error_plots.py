@@ -1,5 +1,7 @@
 """Plots decode, have the size their panels need, and carry each method's colour."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,8 +20,7 @@ def evaluation_of(
     level = 20 / (n_lights or all_lights) + light_noise_deg
     results = tuple(
         Result(method, capture, n_lights or all_lights, (m + level, m + level + 0.5, m + level + 1), 1.0)
-        for capture in captures
-        for m, method in enumerate(METHODS, start=3)
+        for capture, (m, method) in product(captures, enumerate(METHODS, start=3))
     )
     return Evaluation(Protocol(n_lights, 3, light_noise_deg=light_noise_deg), results)
 

@@ -10,14 +10,9 @@ from splinecli.evaluation.tables import AVERAGE, compare, holm, trial_averages
 
 def evaluation_of(**maes_deg: dict[str, tuple[float, ...]]) -> Evaluation:
     """From {capture: {method: MAE of each trial}}."""
-    return Evaluation(
-        Protocol(n_lights=10, trials=10),
-        tuple(
-            Result(method, capture, 10, maes, 1.0)
-            for capture, methods in maes_deg.items()
-            for method, maes in methods.items()
-        ),
-    )
+    pairs = ((capture, *item) for capture, methods in maes_deg.items() for item in methods.items())
+    results = tuple(Result(method, capture, 10, maes, 1.0) for capture, method, maes in pairs)
+    return Evaluation(Protocol(n_lights=10, trials=10), results)
 
 
 # Student's own example (Biometrika 1908): hours of sleep that two drugs gained ten patients.
@@ -89,16 +84,10 @@ def test_pairs_without_a_test_do_not_count_in_the_correction() -> None:
     comparisons = compare(evaluation_of(ball={"a": FIRST, "b": SECOND, "c": shifted}))
     on_ball = {(c.first, c.second): c for c in comparisons if c.capture == "ball"}
     assert on_ball["a", "c"].p_holm is None
-    tested = [on_ball["a", "b"].p_value, on_ball["b", "c"].p_value]
-    assert [on_ball["a", "b"].p_holm, on_ball["b", "c"].p_holm] == pytest.approx(
-        holm([p for p in tested if p is not None])
-    )
+    tested = [on_ball["a", "b"], on_ball["b", "c"]]
+    assert [each.p_holm for each in tested] == pytest.approx(holm([each.p_value for each in tested]))
 
 
 def test_the_average_takes_the_trials_all_captures_have() -> None:
     uneven = evaluation_of(ball={"a": (1.0, 2.0, 9.0)}, cat={"a": (3.0, 5.0)})
     assert trial_averages(uneven, "a") == (2.0, 3.5)
-
-
-def test_one_method_has_nobody_to_differ_from() -> None:
-    assert compare(evaluation_of(ball={"a": (1.0, 2.0)})) == ()

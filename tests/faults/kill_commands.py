@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,29 +28,21 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).parents[1])]
 
 from run import prepare_process, run_warm  # noqa: E402
-from sync_order import missing_syncs, record_calls  # noqa: E402
 
-from kills import changes_files, content, killer  # noqa: E402
+from kills import changes_files, content, killer, missing_syncs, record_calls  # noqa: E402
 
 _MEASURED = re.compile(rb'("(?:seconds|peak_memory_mib|minutes)\\?": ?)(?:[\d.e-]+|{[^}]*})')
 
 
 @dataclass(frozen=True)
 class Replacement:
-    """A command that replaces what another one wrote.
+    """A command that replaces what another one wrote."""
 
-    Args:
-        target: the input, one of the fuzz corpus.
-        old, new: the commands.
-        folder: the folder that the command holds.
-        report: the file that describes the others. None where files are replaced one by one.
-    """
-
-    target: str
-    old: str
+    target: str  # the input, one of the fuzz corpus
+    old: str  # the commands
     new: str
-    folder: str = "out"
-    report: str | None = "report.json"
+    folder: str = "out"  # the folder that the command holds
+    report: str | None = "report.json"  # the file that describes the others. None if files are replaced one by one
 
 
 _INFER = "infer capture --method ls -o out --overwrite -q"
@@ -100,7 +92,15 @@ class KilledCommand:
         from splinecli.system.publishing import held_folder
 
         self._reset()
-        was_killed = self._run_killed(step, seconds)
+        child = os.fork()
+        if child == 0:
+            if step is not None:
+                sys.addaudithook(killer(step))
+            os._exit(run_warm(self.case, self.replacement.new))
+        if seconds is not None:
+            time.sleep(seconds)
+            os.kill(child, signal.SIGKILL)
+        was_killed = os.WIFSIGNALED(os.waitpid(child, 0)[1])
         self.kill_count += was_killed  # a run may end before its time
         if not was_killed and self._state(self.case) != self.new:
             yield "a run that was not killed ends with other files"
@@ -120,10 +120,7 @@ class KilledCommand:
     def missing_syncs(self) -> Iterator[str]:
         """Yield what an undisturbed run renames before it is on the disk."""
         self._reset()
-        calls = record_calls(self._run_again)
-        if not any(kind == "rename" for kind, _, _ in calls):
-            yield "nothing is renamed"
-        yield from missing_syncs(calls, self.replacement.report)
+        yield from missing_syncs(record_calls(self._run_again), self.replacement.report)
 
     def count_steps(self) -> int:
         """Return the number of changes of files in an undisturbed run."""
@@ -172,64 +169,39 @@ class KilledCommand:
         assert run_warm(self.case, command) == 0, command
         return time.monotonic() - started
 
-    def _run_killed(self, step: int | None, seconds: float | None) -> bool:
-        child = os.fork()
-        if child == 0:
-            if step is not None:
-                sys.addaudithook(killer(step))
-            os._exit(run_warm(self.case, self.replacement.new))
-        if seconds is not None:
-            time.sleep(seconds)
-            os.kill(child, signal.SIGKILL)
-        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
-
     def _state(self, folder: Path) -> dict[str, bytes]:
-        """Return the content of the output by name, without what differs from run to run: the log has minutes."""
-        files = content(folder / "out").items()
-        return {name: _without_measurements(name, value) for name, value in files if name != "run/metrics.csv"}
-
-
-def _without_measurements(name: str, value: bytes) -> bytes:
-    """Return a file without times and memory. A checkpoint states the seconds, and so the length of its header."""
-    if name.endswith("checkpoint.safetensors"):
-        end = 8 + int.from_bytes(value[:8], "little")
-        value = value[8:end].rstrip() + value[end:]
-    return _MEASURED.sub(rb"\1", value)
-
-
-def _print_problems(what: str, problems: Iterable[str]) -> bool:
-    """Print the problems, and return whether there are any."""
-    found = [f"{what}: {problem}" for problem in problems]
-    print("".join(f"{line}\n" for line in found), end="")
-    return bool(found)
+        """Return the content of the output by name, without what differs from run to run, such as times and memory."""
+        files = content(folder / "out")
+        files.pop("run/metrics.csv", None)
+        for name in (name for name in files if name.endswith("checkpoint.safetensors")):
+            end = 8 + int.from_bytes(files[name][:8], "little")  # the seconds change the length of its header
+            files[name] = files[name][8:end].rstrip() + files[name][end:]
+        return {name: _MEASURED.sub(rb"\1", value) for name, value in files.items()}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200, help="kills at random times, beside those at every step")
     parser.add_argument("--steps", type=int, help="kill at so many of the steps only, evenly chosen")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", action="append", choices=REPLACEMENTS)
     options = parser.parse_args()
     prepare_process()
-    rng, failures, kills = random.Random(options.seed), 0, 0
-    names = options.command or list(REPLACEMENTS)
+    rng, failed, kills = random.Random(0), list[str](), 0
     with tempfile.TemporaryDirectory() as work:
-        for name in names:
+        for name in REPLACEMENTS:
             command = KilledCommand(name, Path(work))
-            failures += _print_problems(name, command.missing_syncs())
+            failed += [f"{name}: {problem}" for problem in command.missing_syncs()]
             total = command.count_steps()
             steps = sorted({int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))})
             for step in steps:
-                failures += _print_problems(f"{name}, step {step}", command.kill(step=step))
-            for _ in range(options.kills // len(names)):
+                failed += [f"{name}, step {step}: {problem}" for problem in command.kill(step=step)]
+            for _ in range(options.kills // len(REPLACEMENTS)):
                 seconds = rng.uniform(0, 1.1 * command.seconds)
-                failures += _print_problems(f"{name}, {seconds:.3f} s", command.kill(seconds=seconds))
+                failed += [f"{name}, {seconds:.3f} s: {problem}" for problem in command.kill(seconds=seconds)]
             kills += command.kill_count
             told = f"{command.kill_count} kills, at {len(steps)} of {total} steps and at random times"
             print(f"{name}: {told}; {command.new_count} ended in the new files", flush=True)
-    print(f"{kills} kills, {failures} failed")
-    return bool(failures)
+    print(*failed, f"{kills} kills, {len(failed)} failed", sep="\n")
+    return bool(failed)
 
 
 if __name__ == "__main__":

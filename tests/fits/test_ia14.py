@@ -7,10 +7,9 @@ import pytest
 import quadprog
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from scenes import cap_directions, halfway
-from splinecli.fits.ia14 import fit, minimise_nonnegative, solve_ia14
+from splinecli.fits.ia14 import fit
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 
@@ -41,35 +40,6 @@ def test_lambertian_is_exact() -> None:
         found = make_estimator("ia14", ON_CPU).estimate(observations.astype(np.float32), lights)
         assert np.median(angle_between_deg(found, truth)) < 1e-4
         assert angle_between_deg(found, truth).max() < 0.02
-
-
-def inverted(normals: Array, lights: Array, coefficients: Array) -> Array:
-    """The observations (P, F) at which g is n.l, by halving; 0 in attached shadow."""
-    shading = (normals @ lights.T).clip(0)
-    weights = np.einsum("pik,fk->pfi", coefficients, bernstein(lights[:, 2], 4))
-    low, high = np.zeros_like(shading), np.ones_like(shading)
-    for _ in range(60):
-        middle = (low + high) / 2
-        below = (bernstein(middle, 2) * weights).sum(axis=-1) < shading
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.where(shading > 0, high, 0)
-
-
-def monotone_coefficients(count: int, seed: int) -> Array:
-    """(P, 3, 5): zero at the observation 0, from 1.1 to 2.2 at the observation 1."""
-    rng = np.random.default_rng(seed)
-    last = rng.uniform(1.1, 2.2, (count, 5))
-    return np.stack((np.zeros((count, 5)), last * rng.uniform(0.2, 0.95, (count, 5)), last), axis=1)
-
-
-def test_exact_where_the_inverse_is_such_a_polynomial() -> None:
-    truth, lights = cap_directions(200, 50, 2, even=True), cap_directions(96, 60, 3, even=True)
-    observations = inverted(truth, lights, monotone_coefficients(200, 4))
-    found = fit(torch.as_tensor(observations), torch.as_tensor(lights), prior_weight=1e-9)[0].numpy()
-    assert angle_between_deg(found, truth).max() < 0.01
-    # The prior draws towards Lambert's law, which costs little with many lights.
-    found = solve_ia14(torch.as_tensor(observations), torch.as_tensor(lights)).numpy()
-    assert angle_between_deg(found, truth).mean() < 0.3
 
 
 def objective_of(
@@ -119,23 +89,3 @@ def test_optimum_is_the_librarys(kind: str, count: int) -> None:
         optimum = expected @ hessian @ expected
         assert found @ hessian @ found == pytest.approx(optimum, rel=1e-6, abs=1e-9)
         assert angle_between_deg(n[None], expected[None, :3]).item() < 0.01
-
-
-@pytest.mark.parametrize("rows", [30, 7], ids=["well determined", "nearly singular"])
-def test_optimum_is_scipys(rows: int) -> None:
-    rng = np.random.default_rng(0)
-    # Columns alike make for many exchanges; with 7 rows for 10 unknowns the ridge alone makes the optimum unique.
-    matrices = rng.uniform(size=(100, rows, 10))
-    ridge = np.broadcast_to(1e-4 * np.eye(10), (100, 10, 10))
-    matrices = np.concatenate((matrices, ridge), axis=1)
-    signal = (matrices @ rng.uniform(-0.3, 1, size=(100, 10, 1)))[..., 0]
-    targets = signal + np.concatenate((0.1 * rng.normal(size=(100, rows)), np.zeros((100, 10))), axis=1)
-    hessian, linear = matrices.mT @ matrices, (matrices.mT @ targets[..., None])[..., 0]
-    found = minimise_nonnegative(torch.as_tensor(hessian), torch.as_tensor(linear)).numpy()
-    expected = np.stack([nnls(a, b)[0] for a, b in zip(matrices, targets, strict=True)])
-    assert 0.2 < (expected == 0).mean() < 0.8
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
-    gradient = (hessian @ found[..., None])[..., 0] - linear
-    assert found.min() >= 0
-    assert gradient.min() > -1e-9
-    assert np.abs(gradient * found).max() < 1e-9

@@ -22,23 +22,14 @@ OUT = "out"
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of input.
+    """A kind of input."""
 
-    Args:
-        name: for people, and the name of its folder.
-        write: writes its files into an empty folder.
-        files: patterns of the files that are mutated.
-        commands: the arguments of each command that reads them.
-        earlier: the commands whose output is there before; the first of `commands` if there is none.
-        grows: whether a command that fails late has already added to the earlier output.
-    """
-
-    name: str
-    write: Callable[[Path], None]
-    files: tuple[str, ...]
-    commands: tuple[str, ...]
-    earlier: tuple[str, ...] = ()
-    grows: bool = False
+    name: str  # for people, and the name of its folder
+    write: Callable[[Path], None]  # writes its files into an empty folder
+    files: tuple[str, ...]  # patterns of the files that are mutated
+    commands: tuple[str, ...]  # the arguments of each command that reads them
+    earlier: tuple[str, ...] = ()  # the commands whose output is there before; the first of `commands` if there is none
+    grows: bool = False  # whether a command that fails late has already added to the earlier output
 
 
 def normals() -> np.ndarray:
@@ -50,10 +41,6 @@ def normals() -> np.ndarray:
 
 def shaded(light: np.ndarray) -> np.ndarray:
     return np.rint((normals() @ light).clip(0) * 50_000).astype(np.uint16)
-
-
-def picture_of(vectors: np.ndarray) -> np.ndarray:
-    return np.rint((vectors + 1) / 2 * 65_535).astype(np.uint16)
 
 
 def png_capture(folder: Path) -> None:
@@ -101,15 +88,14 @@ def tiff_capture(folder: Path) -> None:
     (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
 
 
-def pgm_capture(folder: Path) -> None:
+def pgm_and_stack_captures(folder: Path) -> None:
+    for name in ("pgm", "stack"):
+        (folder / name).mkdir()
+        np.savetxt(folder / name / "lights.txt", LIGHTS)
     for number, light in enumerate(LIGHTS):
-        cv2.imwrite(str(folder / f"{number}.pgm"), shaded(light))
-    np.savetxt(folder / "lights.txt", LIGHTS)
-
-
-def stack_capture(folder: Path) -> None:
-    tifffile.imwrite(folder / "stack.tif", np.stack([shaded(light) for light in LIGHTS]), photometric="minisblack")
-    np.savetxt(folder / "lights.txt", LIGHTS)
+        cv2.imwrite(str(folder / f"pgm/{number}.pgm"), shaded(light))
+    pictures = np.stack([shaded(light) for light in LIGHTS])
+    tifffile.imwrite(folder / "stack/stack.tif", pictures, photometric="minisblack")
 
 
 def light_files(folder: Path) -> None:
@@ -132,7 +118,7 @@ def light_files(folder: Path) -> None:
 
 
 def normal_maps(folder: Path) -> None:
-    cv2.imwrite(str(folder / "n.png"), picture_of(normals())[:, :, ::-1])
+    cv2.imwrite(str(folder / "n.png"), np.rint((normals()[..., ::-1] + 1) / 2 * 65_535).astype(np.uint16))
     tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
@@ -192,17 +178,11 @@ def meshes(folder: Path) -> None:
         shape.export(folder / f"m.{ending}", file_type=ending)
 
 
-def earlier_results(folder: Path) -> None:
-    """Captures whose results are read again: reports, thumbnails, finished trials."""
+def two_captures(folder: Path) -> None:
+    """Captures whose results are read again: reports, thumbnails, finished trials, pixel sets."""
     for name in ("capture", "second"):
         (folder / name).mkdir()
         png_capture(folder / name)
-
-
-def pixel_set(folder: Path) -> None:
-    (folder / "capture").mkdir()
-    png_capture(folder / "capture")
-    shutil.copytree(folder / "capture", folder / "second")
     write_settings(folder)
 
 
@@ -259,8 +239,9 @@ TARGETS = (
     Target("tiff", tiff_capture, ("*",), (
         "infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite",
     )),
-    Target("pgm", pgm_capture, ("*.pgm",), ("infer . --method ls -o out --overwrite",)),
-    Target("stack", stack_capture, ("*.tif",), ("infer . --method ls -o out --overwrite", "info .")),
+    Target("pgm and stack", pgm_and_stack_captures, ("*/*.pgm", "*/*.tif"), (
+        *each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack",
+    )),
     Target("lights", light_files, ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"), (
         *each("infer . --method ls --lights {} -o out --overwrite",
               "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome"),
@@ -285,12 +266,12 @@ TARGETS = (
         for ending in ("png", "tif", "jpg")
         for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
     )),
-    Target("set", pixel_set, ("out/set/*", "out/set/*/*"), (
+    Target("set", two_captures, ("out/set/*", "out/set/*/*"), (
         "prepare capture second -o out/set",
         "prepare capture -o out/set --update",
         "train out/set -o out/run -q --config a.toml",
     ), earlier=("prepare capture -o out/set",), grows=True),
-    Target("earlier", earlier_results,
+    Target("earlier", two_captures,
            ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"), (
         "infer capture --method ls -o out",
         "infer second --method ls -o out --html --surface",
@@ -314,13 +295,8 @@ def write_corpus(
 ) -> list[Target]:
     """Write the files of the targets into folders of their names, each with the output of an earlier run.
 
-    Every command runs once on whole input. This also imports all that it needs.
-
-    Args:
-        folder: where to write.
-        case: where the commands will run. They run there now, because reports and checkpoints name absolute paths.
-        run: runs a command in a folder and returns its exit code.
-        names: names of targets; empty for all.
+    Every command runs once on whole input, which also imports all that it needs. It runs in the folder `case`, where
+    the commands will run, because reports and checkpoints name absolute paths. Without names, all targets are written.
     """
     targets = [target for target in TARGETS if not names or target.name in names]
     folder.mkdir()

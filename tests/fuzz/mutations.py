@@ -101,14 +101,9 @@ def number(data: bytes, rng: random.Random) -> bytes:
 def lines(data: bytes, rng: random.Random) -> bytes:
     rows = data.split(b"\n")
     place = rng.randrange(len(rows))
-    change = rng.randrange(4)
-    if change == 0:
-        rows.insert(place, rng.choice(rows))
-    elif change == 1:
-        del rows[place]
-    elif change == 2:
-        rows[place] = rng.choice(ODD_TEXTS).encode("utf-8", "surrogatepass")
-    else:
+    changed = [rng.choice(rows), rows[place]], [], [rng.choice(ODD_TEXTS).encode("utf-8", "surrogatepass")]
+    rows[place : place + 1] = rng.choice(changed)
+    if rng.random() < 0.25:
         rng.shuffle(rows)
     return b"\n".join(rows)
 
@@ -307,21 +302,15 @@ def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:
     existing = [file for file in others if file.is_file()]
     other = rng.choice(existing or [path]).read_bytes()
     path.unlink()
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "loop":
-        path.symlink_to(path.name)
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-    elif kind == "other file":
+    if kind in ("other file", "huge", "unreadable"):
         path.write_bytes(other)
-    elif kind == "huge":
-        with path.open("wb") as file:
-            file.write(other)
-            file.truncate(3 << 30)
-    elif kind == "unreadable":
-        path.write_bytes(other)
-        path.chmod(0)
+    changes: dict[str, Callable[[], object]] = {
+        "folder": path.mkdir,
+        "pipe": lambda: os.mkfifo(path),
+        "loop": lambda: path.symlink_to(path.name),
+        "device": lambda: path.symlink_to("/dev/zero"),
+        "huge": lambda: os.truncate(path, 3 << 30),
+        "unreadable": lambda: path.chmod(0),
+    }
+    changes.get(kind, lambda: None)()
     return f"{kind} {path.name}"

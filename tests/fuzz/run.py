@@ -43,7 +43,6 @@ from mutations import mutate, odd_path, rename  # noqa: E402
 from kills import content  # noqa: E402
 from splinecli.errors import printable  # noqa: E402
 
-RENAMED_SHARE = 0.1  # of the cases, which have odd names in place of odd contents
 CPU_SECONDS, WALL_SECONDS, MEMORY, MEMORY_IF_REFUSED = 10, 300, 10**9, 300 * 2**20
 ADDRESS_SPACE = 4 * 10**9
 CASES_OF_A_PROCESS = 200
@@ -182,7 +181,8 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
         yield "traceback"
     if any("Warning:" in line and "/trimesh/" not in line for line in ended.err.split("\n")):
         yield "a warning of Python"
-    told = [line for line in ended.err.split("\n") if line.startswith("splinecli: ") and not _is_note(line)]
+    notes = ("splinecli: warning: ", "splinecli: note: ")
+    told = [line for line in ended.err.split("\n") if line.startswith("splinecli: ") and not line.startswith(notes)]
     if ended.code and len(told) != 1:
         yield f"{len(told)} messages"
     if any(not (c.isprintable() or c == "\n") for c in ended.out + ended.err):
@@ -198,10 +198,6 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
         yield f"files are left: {left}"
 
 
-def _is_note(line: str) -> bool:
-    return line.startswith(("splinecli: warning: ", "splinecli: note: "))
-
-
 def run_case(
     number: int, corpus: Path, targets: list[Target], work: Path, worker: Worker
 ) -> tuple[str, Ended, list[str]]:
@@ -215,8 +211,12 @@ def run_case(
     changed = rng.sample(files, min(len(files), rng.choice((1, 1, 1, 2))))
     others = [path for path in files if path not in changed] or files[:1]
     command = rng.choice(target.commands)
-    if rng.random() < RENAMED_SHARE:
-        did, command = rename_one(folder, files, command, rng)
+    if rng.random() < 0.1:  # an odd name in place of odd contents
+        folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name != OUT]
+        path = rng.choice(folders if folders and rng.random() < 0.5 else files)
+        new = rename(path, rng)
+        words = [odd_path(new.name, rng) if word == path.name else word for word in shlex.split(command)]
+        did, command = f"{path.name} is now {new.name!r}", shlex.join(words)
     else:
         did = ", ".join(mutate(path, others, rng) for path in changed)
     before = {} if target.grows else content(folder / OUT)
@@ -225,62 +225,34 @@ def run_case(
     return f"{target.name}: {did}; {printable(command)}", ended, found
 
 
-def rename_one(folder: Path, files: list[Path], command: str, rng: random.Random) -> tuple[str, str]:
-    """Rename a file or a folder of a case, here and in the command. Return what was done, and the new command."""
-    folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name != OUT]
-    path = rng.choice(folders if folders and rng.random() < 0.5 else files)
-    new = rename(path, rng)
-    words = [odd_path(new.name, rng) if word == path.name else word for word in shlex.split(command)]
-    return f"{path.name} is now {new.name!r}", shlex.join(words)
-
-
-def run_cases(
-    cases: int, *, first: int = 0, minutes: float = 60.0, names: tuple[str, ...] = (), keep: Path | None = None
-) -> tuple[int, Counter[str], list[str]]:
-    """Run cases, and return their number, the counts of exit codes and kinds, and what failed."""
-    prepare_process()
-    codes: Counter[str] = Counter()
-    failed, done, deadline = [], 0, time.monotonic() + 60 * minutes
-    with tempfile.TemporaryDirectory(dir=FAST if FAST.exists() else None) as temporary:
-        work = Path(temporary)
-        worker = Worker(work)
-        targets = write_corpus(work / "corpus", work / "case", run_warm, names)
-        gc.collect()
-        gc.freeze()  # a collection in a forked process would copy all memory
-        for number in range(first, first + cases):
-            if time.monotonic() > deadline:
-                break
-            what, ended, found = run_case(number, work / "corpus", targets, work, worker)
-            done += 1
-            codes.update((f"exit code {ended.code}", what.split(":")[0]))
-            if found:
-                last = ended.err.strip().split("\n")[-1][:300]
-                failed.append(f"case {number}: {', '.join(found)}\n  {what}\n  {ended.seconds:.1f} s: {last}")
-                print(failed[-1], flush=True)
-                if keep is not None:
-                    options = {"symlinks": True, "ignore": _special, "dirs_exist_ok": True}
-                    shutil.copytree(work / "case", keep / str(number), **options)
-    return done, codes, failed
-
-
-def _special(folder: str, names: list[str]) -> list[str]:
-    return [name for name in names if not (Path(folder, name).is_dir() or Path(folder, name).is_file())]
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--target", action="append", default=[], help="only this kind of input")
-    parser.add_argument("--keep", type=Path, help="copy the files of failed cases into this folder")
     options = parser.parse_args()
-    started = time.monotonic()
-    done, codes, failed = run_cases(
-        options.cases, first=options.first, minutes=options.minutes, names=tuple(options.target), keep=options.keep
-    )
+    prepare_process()
+    codes: Counter[str] = Counter()
+    failed, done, started = 0, 0, time.monotonic()
+    with tempfile.TemporaryDirectory(dir=FAST if FAST.exists() else None) as temporary:
+        work = Path(temporary)
+        worker = Worker(work)
+        targets = write_corpus(work / "corpus", work / "case", run_warm, tuple(options.target))
+        gc.collect()
+        gc.freeze()  # a collection in a forked process would copy all memory
+        for number in range(options.first, options.first + options.cases):
+            if time.monotonic() > started + 60 * options.minutes:
+                break
+            what, ended, found = run_case(number, work / "corpus", targets, work, worker)
+            done += 1
+            codes.update((f"exit code {ended.code}", what.split(":")[0]))
+            if found:
+                failed += 1
+                last = ended.err.strip().split("\n")[-1][:300]
+                print(f"case {number}: {', '.join(found)}\n  {what}\n  {ended.seconds:.1f} s: {last}", flush=True)
     counts = ", ".join(f"{count} x {key}" for key, count in sorted(codes.items()))
-    print(f"{done} cases in {time.monotonic() - started:.0f} s, {len(failed)} failed: {counts}")
+    print(f"{done} cases in {time.monotonic() - started:.0f} s, {failed} failed: {counts}")
     return bool(failed)
 
 

@@ -6,15 +6,20 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, shade, sphere, sphere_cap
+from scenes import cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
 from splinecli import estimate_normals
 from splinecli.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.confidence import add_common_error
 from splinecli.errors import InputError, UsageError
 from splinecli.lights import unknown_lights
-from splinecli.lights.light_fit import fit_near
-from splinecli.lights.unknown_lights import OutlineTurn, find_lights, outline_share, turn_at_outline
-from splinecli.maths.normals import angle_between_deg
+from splinecli.lights.unknown_lights import (
+    bump_log_odds,
+    find_lights,
+    lower_lights,
+    outline_share,
+    turn_at_outline,
+)
+from splinecli.maths.normals import angle_between_deg, unit
 
 SIZE = 64
 NORMALS, INSIDE = sphere(SIZE)
@@ -144,21 +149,6 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow:
     assert mean_angle(found.directions, true) < 6
 
 
-def test_the_images_correct_guesses_that_disagree_with_each_other() -> None:
-    """A matte surface cannot tell a common turn, but nearly all of the rest."""
-    true = lights(12)
-    guessed = true + np.random.default_rng(2).normal(scale=0.06, size=true.shape)
-    guessed /= np.linalg.norm(guessed, axis=1, keepdims=True)
-    fit = fit_near(observed(true), guessed, np.full(12, 5.0), intensity_error=0.0, worth_pixels=50)
-    assert fit is not None and fit.after < 0.5 * fit.before
-
-    def without_common_turn(directions: NDArray[np.float64]) -> float:
-        turn, _ = Rotation.align_vectors(true, directions)
-        return mean_angle(turn.apply(directions), true)
-
-    assert without_common_turn(fit.directions) < 0.4 * without_common_turn(guessed)
-
-
 @pytest.mark.parametrize("turn_deg", [(8, 0, 0), (0, -6, 0), (3, 4, 5)])
 def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -> None:
     true = lights(20)
@@ -204,13 +194,69 @@ def test_python() -> None:
             estimate_normals(images, lights_given, INSIDE, **options)
 
 
-def test_the_outline_turns_the_lights_no_further_than_expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The far rim of a vessel's mouth is not turned outwards, and a turn that makes it so is wrong."""
-    true = lights()
-    found = {}
-    for angle in (0.2, 2.5):
-        monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: (true, np.full(10, 4.0), np.ones(10)))
-        turn = OutlineTurn(np.array((angle, 0.0, 0.0)), 0.1)
-        monkeypatch.setattr(unknown_lights, "turn_at_outline", lambda *_, turn=turn: turn)
-        found[angle] = mean_angle(find_lights(observed(true), INSIDE, True).directions, true)
-    assert found[2.5] < 4 and found[0.2] < 4
+Array = NDArray[np.float64]
+
+OPPOSITE = (-1, -1, 1)
+
+
+def cap_on_plate(size: int, lights: Array, *, hollow: bool) -> NDArray[np.float32]:
+    """Return the images (P, F) of half a sphere on a plate, or sunk into it, with attached and cast shadows."""
+    radius = 0.6
+    x, y = square_grid(size)
+    height = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0)) * (-1 if hollow else 1)
+    inside = x**2 + y**2 < radius**2
+    points = np.stack((x, y, np.where(inside, height, 0)), axis=-1).reshape(-1, 3)
+    normals = np.tile((0.0, 0.0, 1.0), (len(points), 1))
+    normals[inside.ravel()] = points[inside.ravel()] / radius * (-1 if hollow else 1)
+    normals = unit(normals * (1, 1, 1) + (0, 0, 0.2))  # no vertical walls
+    along = points @ lights.T
+    if hollow:  # the ray leaves through the mouth, or meets the wall
+        mouth = points[:, None, :2] - (points[:, 2:] / lights[:, 2])[..., None] * lights[:, :2]
+        shadow = inside.ravel()[:, None] & (np.linalg.norm(mouth, axis=2) > radius)
+    else:  # the ray from the plate meets the sphere
+        nearest = (points**2).sum(axis=1)[:, None] - along**2
+        shadow = ~inside.ravel()[:, None] & (nearest < radius**2) & (along < 0)
+    return (shade(normals, lights, noise=0.002) * ~shadow).astype(np.float32)
+
+
+@pytest.mark.parametrize("zenith_deg", [60, 70])
+@pytest.mark.parametrize("hollow", [False, True])
+def test_cast_shadows_tell_a_bump_from_a_hollow(hollow: bool, zenith_deg: float) -> None:
+    lights, mask = ring_lights(10, zenith_deg), np.ones((64, 64), np.bool_)
+    images = cap_on_plate(64, lights, hollow=hollow)
+    assert bump_log_odds(images, mask, lights) > 3
+    assert bump_log_odds(images, mask, lights * OPPOSITE) < -3
+
+
+def test_the_outline_tells_a_bump_from_a_hollow() -> None:
+    normals, inside = sphere(64)
+    lights = ring_lights(8, 40)
+    images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
+    assert bump_log_odds(images, inside, lights) > 5
+    assert bump_log_odds(images, inside, lights * OPPOSITE) < -5
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_a_wrong_guess_of_the_network_is_turned_around(hollow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    lights, mask = ring_lights(10, 60), np.ones((64, 64), np.bool_)
+    guess = lights * OPPOSITE, np.full(10, 16.0), np.ones(10)
+    monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: guess)
+    found = find_lights(cap_on_plate(64, lights, hollow=hollow), mask, True, refuse=False)
+    assert angle_between_deg(found.directions, lights).mean() < 8
+
+
+@pytest.mark.parametrize("raised", [1.0, 1.6])
+def test_low_lights_are_lowered_until_the_albedo_is_even(raised: float) -> None:
+    normals, inside = sphere(64)
+    lights = ring_lights(8, 65)
+    images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
+    given = unit(lights * (1, 1, raised))
+    before, after = (angle_between_deg(found, lights).mean() for found in (given, lower_lights(images, given, 10.0)))
+    assert after <= max(0.5 * before, 0.5)
+
+
+def test_high_lights_are_not_lowered() -> None:
+    normals, inside = sphere(64)
+    lights = ring_lights(8, 30)
+    images = shade(normals[inside], lights).astype(np.float32)
+    np.testing.assert_array_equal(lower_lights(images, lights, 10.0), lights)

@@ -1,10 +1,21 @@
-"""Unit normals, angles and pictures."""
+"""Unit normals: angles, pictures, errors, and slopes and curvatures of analytic surfaces."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.maths.normals import Convention, angle_between_deg, decode_picture, encode_picture, unit
+from scenes import square_grid
+from splinecli.maths.normals import (
+    Convention,
+    angle_between_deg,
+    angular_error_map_deg,
+    curvature_of_normals,
+    decode_picture,
+    encode_picture,
+    gradient_of_normals,
+    summarise_errors,
+    unit,
+)
 
 
 def random_normals(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -82,3 +93,84 @@ def test_black_and_mid_gray_are_no_normals(dtype: type[np.unsignedinteger]) -> N
     decoded = decode_picture(picture)
     assert not decoded[:3].any()
     np.testing.assert_allclose(decoded[3], [0, 0, 1], atol=0.01)
+
+
+def tilted(degrees: float) -> list[float]:
+    return [float(np.sin(np.radians(degrees))), 0.0, float(np.cos(np.radians(degrees)))]
+
+
+def test_error_map() -> None:
+    truth = np.array([[[0, 0, 1], [0, 0, 1], [0, 0, 0], [0, 0, 1]]], np.float32)
+    normals = np.array([[tilted(30), [0, 0, -1], [0, 0, 1], [0, 0, 1]]], np.float32)
+    errors = angular_error_map_deg(normals, truth, np.array([[True, True, True, False]]))
+    # Right by definition; flipped is 180, not 0; no truth; outside the mask.
+    np.testing.assert_allclose(errors, [[30, 180, np.nan, np.nan]], atol=1e-5)
+
+
+def test_summary_of_a_known_list() -> None:
+    errors = summarise_errors(np.array([np.nan, *range(11), np.nan]))
+    # 0, 1, ... 10: mean and median 5, the ninth tenth at 9; five of eleven under 5, ten under 10.
+    assert (errors.mean, errors.median, errors.p90) == (5, 5, 9)
+    assert errors.under_5 == pytest.approx(5 / 11)
+    assert errors.under_10 == pytest.approx(10 / 11)
+
+
+def test_float32_maps_are_summed_in_float64() -> None:
+    errors = summarise_errors(np.full(10_000_000, 0.1, np.float32))
+    assert errors.mean == pytest.approx(float(np.float32(0.1)), rel=1e-9)
+
+
+def test_nothing_to_summarise() -> None:
+    assert summarise_errors(np.full((3, 3), np.nan, np.float32)) is None
+    assert summarise_errors(np.array([])) is None
+
+
+SIZE, REACH = 120, 60.0
+X, Y = square_grid(SIZE, REACH * (1 - 1 / SIZE))
+RADIUS = 75.0
+
+
+def normals(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return unit(np.stack((-p, -q, np.ones_like(p)), axis=-1)).astype(np.float32)
+
+
+def sphere(sign: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normals of a ball (1) or of a bowl (-1), and a ragged mask."""
+    inside = np.hypot(X, Y) < 55
+    inside[50:60, 40:44] = False
+    z = np.sqrt(RADIUS**2 - X**2 - Y**2, where=inside, out=np.ones_like(X))
+    return normals(-sign * X / z, -sign * Y / z), inside
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sphere(sign: int) -> None:
+    normal_map, mask = sphere(sign)
+    found = curvature_of_normals(normal_map, mask)
+    expected = np.tile((sign / RADIUS, 1 / RADIUS**2), (len(found[mask]), 1))
+    np.testing.assert_allclose(found[mask], expected, rtol=0.02)
+    assert np.isnan(found[~mask]).all()
+    slopes = gradient_of_normals(normal_map, mask)
+    np.testing.assert_allclose(slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5)
+
+
+def test_a_cylinder_and_a_saddle() -> None:
+    everywhere = np.ones(X.shape, bool)
+    inner = np.hypot(X, Y) < 40
+    cylinder = curvature_of_normals(normals(-X / np.sqrt(RADIUS**2 - X**2), 0 * X), everywhere)[inner]
+    np.testing.assert_allclose(cylinder[:, 0], 0.5 / RADIUS, rtol=0.02)
+    np.testing.assert_allclose(cylinder[:, 1], 0, atol=1e-6)
+    # z = x y / R, whose curvature at the middle is -1/R^2 (Gauss) and 0 (mean).
+    saddle = curvature_of_normals(normals(Y / 300, X / 300), everywhere)[SIZE // 2, SIZE // 2]
+    assert saddle[1] == pytest.approx(-1 / 300**2, rel=0.02) and abs(saddle[0]) < 1e-6
+
+
+def test_noise_falls_with_the_square_of_sigma() -> None:
+    noisy = unit(normals(0 * X, 0 * X) + 0.02 * np.random.default_rng(1).normal(size=(*X.shape, 3))).astype(np.float32)
+    inner = np.hypot(X, Y) < 40
+    spread = [curvature_of_normals(noisy, np.ones(X.shape, bool), sigma)[inner][:, 0].std() for sigma in (1.5, 3)]
+    assert spread[0] / spread[1] == pytest.approx(4, rel=0.3)
+
+
+def test_a_steep_normal_has_no_slope() -> None:
+    steep = np.tile(np.float32((0.9995, 0, 0.03)), (3, 3, 1))
+    assert np.isnan(gradient_of_normals(steep, np.ones((3, 3), bool))).all()

@@ -120,16 +120,3 @@ def test_maps_follow_the_lights(name: str, seed: int) -> None:
     one, other = sparse_map(observations, directions), sparse_map(observations[:, order], change(directions)[order])
     torch.testing.assert_close(other.values, changed(one.values))
     assert torch.equal(other.occupied, changed(one.occupied))
-
-
-def test_lights_of_each_pixel_s_own_are_like_shared_ones() -> None:
-    observations, directions = random_rig(3, 5, 10)
-    shared = sparse_map(observations, directions)
-    own = sparse_map(observations, directions.expand(5, 10, 3))
-    assert torch.equal(shared.values, own.values)
-    assert torch.equal(shared.occupied, own.occupied)
-    # And they are looked at pixel by pixel.
-    others = random_rig(4, 1, 10)[1]
-    mixed = sparse_map(observations[:2], torch.stack((directions, others)))
-    assert torch.equal(mixed.values[0], shared.values[0])
-    assert torch.equal(mixed.values[1:], sparse_map(observations[1:2], others).values)

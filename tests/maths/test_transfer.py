@@ -1,10 +1,189 @@
-"""The transfer curve of sRGB at values that everybody knows."""
+"""Transfer curves: sRGB at known values, and profiles written here after ISO 15076-1, and one of LittleCMS."""
 
+import io
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
 
+from scenes import with_chunk
+from splinecli.capture import open_capture, read_capture
+from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import decode_transfer, encode_srgb, parse_transfer
+from splinecli.maths.transfer import TransferCurve, decode_transfer, encode_srgb, parse_transfer, profile_curve
+
+SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+STORED = np.linspace(0, 1, 1001).astype(np.float32)
+PIXELS = (np.indices((9, 11)).sum(axis=0)[..., None] * (500, 700, 900) + 3000).astype(np.uint16)
+
+
+def curv(*numbers: int) -> bytes:
+    return b"curv" + bytes(4) + struct.pack(f">I{len(numbers)}H", len(numbers), *numbers)
+
+
+def para(kind: int, *numbers: float) -> bytes:
+    fixed = (round(65536 * number) for number in numbers)
+    return b"para" + bytes(4) + struct.pack(f">HH{len(numbers)}i", kind, 0, *fixed)
+
+
+def profile(*curves: bytes, space: bytes = b"RGB ", name: str = "Made up") -> bytes:
+    """A profile with one curve for each channel, or the same one for all."""
+    names = (b"kTRC",) if space == b"GRAY" else (b"rTRC", b"gTRC", b"bTRC")
+    text = name.encode("utf-16-be")
+    tags = [(b"desc", b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(text), 28) + text)]
+    tags += [(name, curves[min(i, len(curves) - 1)]) for i, name in enumerate(names)]
+    table, data, at = b"", b"", 132 + 12 * len(tags)
+    for tag, content in tags:
+        table += tag + struct.pack(">II", at + len(data), len(content))
+        data += content
+    return bytes(16) + space + bytes(16) + b"acsp" + bytes(88) + struct.pack(">I", len(tags)) + table + data
+
+
+def write(path: Path, icc: bytes | None, pixels: NDArray[Any] = PIXELS) -> Path:
+    if path.suffix == ".tif":
+        tifffile.imwrite(path, pixels, photometric="rgb", iccprofile=icc)
+    elif path.suffix == ".jpg":
+        Image.fromarray((pixels // 257).astype(np.uint8)).save(path, icc_profile=icc)
+    else:
+        png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
+        if icc is not None:
+            png = with_chunk(png, b"iCCP", b"p\0\0" + zlib.compress(icc))
+        path.write_bytes(png)
+    return path
+
+
+SRGB_PARAMETERS = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+
+
+@pytest.mark.parametrize(
+    ("icc", "expected"),
+    [
+        (SRGB_PROFILE, None),
+        (profile(para(3, *SRGB_PARAMETERS)), None),
+        (profile(para(4, *SRGB_PARAMETERS, 0, 0)), None),
+        (profile(curv(*np.rint(65535 * decode_transfer(STORED, None)).astype(int))), None),
+        (profile(curv()), 1.0),
+        (profile(curv(256)), 1.0),
+        (profile(curv(0, 65535)), 1.0),
+        (profile(curv(563)), 2.1992),
+        (profile(para(0, 1.8)), 1.8),
+        (profile(curv(461), space=b"GRAY"), 1.8008),
+    ],
+)
+def test_curves_with_a_name(icc: bytes, expected: TransferCurve) -> None:
+    found = profile_curve(icc)
+    assert found is not None and found[1] == expected
+
+
+@pytest.mark.parametrize(
+    ("curve", "expected"),
+    [
+        (para(1, 2, 0.9, 0.1), lambda x: (0.9 * x + 0.1) ** 2),
+        (para(2, 2, 0.8, 0.1, 0.05), lambda x: (0.8 * x + 0.1) ** 2 + 0.05),
+        (curv(0, 10_000, 65_535), lambda x: np.interp(x, (0, 0.5, 1), (0, 10_000 / 65_535, 1))),
+    ],
+)
+def test_curves_without_a_name(curve: bytes, expected: Any) -> None:
+    found = profile_curve(profile(curve))
+    assert found is not None and isinstance(found[1], tuple)
+    np.testing.assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "icc",
+    [
+        b"",
+        b"no profile",
+        SRGB_PROFILE[:200],
+        profile(b"mft2" + bytes(40)),
+        profile(curv(256), curv(500)),  # one curve for each channel
+        profile(curv(256), space=b"CMYK"),
+        profile(curv(20), curv(20)),
+        profile(para(9, 1)),
+        profile(para(3, 2.4, 0, 0, 1, 0.5)),
+        profile(curv(65535, 0)),
+        profile(b"curv" + bytes(4) + struct.pack(">I", 1 << 31)),
+        bytes(36) + b"acsp" + bytes(88) + b"\xff" * 4,
+    ],
+)
+def test_profiles_without_a_usable_curve(icc: bytes) -> None:
+    assert profile_curve(icc) is None
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    by = 'colour profile "Made up"'
+    assert read_header(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
+    assert read_header(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(1.0, by)
+    stated = read_header(write(path, b"no profile")).curve
+    assert stated.unread and stated.curve == (None if suffix == ".jpg" else 1.0)
+    assert not read_header(write(path, None)).curve.unread
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
+    path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
+    tracemalloc.start()
+    assert read_header(path).curve.unread
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+
+
+def test_many_parts_in_a_jpeg(tmp_path: Path) -> None:
+    part = b"\xff\xe2" + struct.pack(">H", 65_535) + b"ICC_PROFILE\0\1\1"
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + (part + bytes(65_535 - 16)) * 100)
+    assert read_header(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
+
+
+def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) -> Path:
+    folder.mkdir()
+    for number in range(4):
+        write(folder / f"{number}{suffix}", icc, (pixels * (1 - number / 10)).astype(np.uint16))
+    (folder / "lights.txt").write_text("0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n")
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix: str) -> None:
+    adobe = capture(tmp_path / "adobe", profile(curv(563), name="Adobe RGB (1998)"), PIXELS, suffix)
+    found = read_capture(adobe)
+    linear = read_capture(capture(tmp_path / "linear", profile(curv(256)), PIXELS, suffix), as_stored=True)
+    assert "display_decoded" not in [warning.code for warning in linear.warnings]
+    plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
+    np.testing.assert_array_equal(linear.observations, plain.observations)
+    expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
+    np.testing.assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
+    (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
+    assert '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear' in told
+
+
+def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "a", SRGB_PROFILE, PIXELS, ".png")
+    write(folder / "2.png", profile(curv(563)))
+    source = open_capture(folder)
+    assert source.radiometry.curve == 1
+    assert [warning.code for warning in source.warnings] == ["display_encoded"]
+    unread = open_capture(capture(tmp_path / "b", profile(b"mft2" + bytes(40)), PIXELS, ".png"))
+    (warning,) = unread.warnings
+    assert "The colour profile of 0.png has no curve" in str(warning) and "Add --transfer" in str(warning)
+
+
+def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:
+    """The files written here are what other programs take them for."""
+    for suffix in (".png", ".jpg", ".tif"):
+        path = write(tmp_path / f"a{suffix}", SRGB_PROFILE, PIXELS // 257 if suffix == ".tif" else PIXELS)
+        with Image.open(path) as image:
+            content = image.info["icc_profile"]
+        assert ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(content))).startswith("sRGB")
 
 
 def test_srgb():

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.methods.distilled import DistilledEstimator, distil
+from splinecli.methods.distilled import DistilledEstimator, distil, draw_sample
 from splinecli.methods.estimator import (
     UNKNOWN_ERROR,
     LeastSquares,
@@ -21,8 +22,6 @@ from splinecli.methods.estimator import (
     confidence,
     student_sizes,
 )
-from splinecli.networks.refine_net import RefineNet
-from splinecli.refinement.refiner import NetworkRefiner
 
 Floats = NDArray[np.floating]
 LIGHTS = spiral_lights(8, 50)
@@ -178,15 +177,6 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_its_map_is_refined_by_its_teacher() -> None:
-    normals, observations = glossy(3000)
-    teacher = sure(observations, normals)
-    assert learn(teacher, SMALL).refiner is None
-    teacher.refiner = NetworkRefiner(RefineNet(), "float32")
-    refiner = learn(teacher, SMALL).refiner
-    assert refiner is teacher.refiner
-
-
 def test_too_few_pixels() -> None:
     """The sample is half of the lit pixels at most: of 127, 63."""
     normals, observations = glossy(127)
@@ -196,10 +186,55 @@ def test_too_few_pixels() -> None:
 
 
 def test_sizes_grow_with_the_capture() -> None:
-    assert student_sizes(100_000)[0] == StudentSize(sample=10_000, steps=1000, width=192)
+    assert student_sizes(100_000)[0] == StudentSize(sample=10_000, steps=1000, width=128)
     assert student_sizes(1_600_000)[0].sample == 20_000
     assert student_sizes(8_000)[0].sample == 2000
     for n_pixels in (1000, 100_000, 24_000_000):
         usual, larger = student_sizes(n_pixels)
         assert usual.sample < larger.sample < n_pixels
         assert usual.width < larger.width
+
+
+def clusters() -> Tensor:
+    """Return 5,000 features near the origin, 20 far away near (9, 0, 0), and one at (0, 30, 0)."""
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(5021, 3, generator=generator) * 0.3
+    points[5000:, 0] += 9
+    points[5020] = torch.tensor((0.0, 30.0, 0.0))
+    return points
+
+
+def test_rare_kinds_are_in_the_sample() -> None:
+    sample = draw_sample(clusters(), 1200, torch.Generator().manual_seed(0))
+    rows = sample.rows.tolist()
+    assert len(set(rows)) == len(rows)
+    assert len(rows) == 1200
+    assert set(range(5000, 5021)) <= set(rows)
+
+
+def test_the_first_rows_are_an_even_sample() -> None:
+    """The far cluster has its share of them, 0.4 %, and not more."""
+    counts = [
+        int((draw_sample(clusters(), 1200, torch.Generator().manual_seed(seed)).rows[:600] >= 5000).sum())
+        for seed in range(8)
+    ]
+    # Poisson of mean 20.1 in all: three standard deviations either way.
+    assert 7 < sum(counts) < 34
+
+
+def test_rare_groups_and_strangers_are_unlike() -> None:
+    points = clusters()
+    sample = draw_sample(points, 1200, torch.Generator().manual_seed(0), rare_share=0.005)
+    unlike = sample.unlike(points)
+    assert unlike[5020]
+    assert unlike.float().mean() <= 0.005
+    none_rare = draw_sample(points, 1200, torch.Generator().manual_seed(0))
+    assert not none_rare.unlike(points).any()
+    assert none_rare.unlike(torch.tensor([[0.0, 0.0, -30.0]])).all()
+
+
+def test_equal_pixels_are_one_group() -> None:
+    sample = draw_sample(torch.ones(500, 4), 100, torch.Generator().manual_seed(0))
+    assert len(sample.rows) == 100
+    assert sample.reach == 0
+    assert not sample.unlike(torch.ones(3, 4)).any()

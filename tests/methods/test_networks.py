@@ -1,6 +1,5 @@
 """SPLINE-Net as an estimator: batches, rotations, progress."""
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -73,17 +72,6 @@ def test_progress_changes_no_bit() -> None:
     watched = network.estimate(observations, lights, progress=done.append)
     assert watched.tobytes() == network.estimate(observations, lights).tobytes()
     assert done == [100, 50]
-
-
-def test_networks_in_several_threads_count_apart() -> None:
-    observations, lights = pixels(60)
-    network = estimator(batch_size=20)
-    done: list[list[int]] = [[], [], []]
-    with ThreadPoolExecutor() as pool:
-        for counts in done:
-            pool.submit(network.estimate, observations, lights, progress=counts.append)
-    assert [sum(counts) for counts in done] == [60, 60, 60]
-    assert done[0] == done[1] == done[2]
 
 
 def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightingAt:

@@ -1,15 +1,12 @@
 """A network that sees the capture: pixels see all pixels of their own capture, and no others."""
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
 
 from distributions import generator as seeded
-from splinecli.errors import ModelError
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.set_branch import ContextLayer, brightness_level
+from splinecli.networks.set_branch import ContextLayer
 from splinecli.networks.spline_net import SplineNet
 from tiny_networks import TINY, random_network
 
@@ -29,10 +26,10 @@ def network() -> SplineNet:
 
 def test_at_first_a_capture_says_nothing() -> None:
     alone, seeing = (SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True))
-    for name, parameter in alone.named_parameters():  # the layers that are zero at first, too
+    for parameter in alone.parameters():  # the layers that are zero at first, too
         torch.nn.init.normal_(parameter, std=0.1) if not parameter.any() else None
-        assert name in dict(seeing.named_parameters())
-    seeing.load_state_dict(alone.state_dict(), strict=False)
+    assert not seeing.load_state_dict(alone.state_dict(), strict=False).unexpected_keys
+    assert alone.encode_context(*pixels(3)) is None
     observations, lights = pixels(12)
     for found, expected in zip(seeing(observations, lights), alone(observations, lights), strict=True):
         assert torch.equal(found, expected)
@@ -75,12 +72,6 @@ def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel
     assert (network(darker, lights).normals - whole).abs().max() > 1e-3
 
 
-def test_levels_are_logarithms_within_each_capture() -> None:
-    levels = brightness_level(torch.tensor([[2.0], [30.0], [0.5], [0.0]]), torch.tensor([1.0, 10.0]))
-    assert levels[:3, 0].tolist() == pytest.approx([math.log(2), math.log(3), math.log(0.5)])
-    assert levels[3].item() == -7
-
-
 def test_attention_and_mean_are_those_of_the_formulas() -> None:
     """One capture, computed once more pixel by pixel and head by head in float64."""
     torch.manual_seed(0)
@@ -100,10 +91,3 @@ def test_attention_and_mean_are_those_of_the_formulas() -> None:
             heads.append(weights @ values[:, part])
         seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
         torch.testing.assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)
-
-
-def test_a_network_without_a_set_branch_sees_no_capture() -> None:
-    with pytest.raises(ModelError, match="'sees_capture' needs 'set_width'"):
-        NetworkConfig.from_dict({"sees_capture": True})
-    observations, lights = pixels(3)
-    assert random_network(**SEES).encode_context(observations, lights) is None

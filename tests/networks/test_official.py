@@ -236,13 +236,6 @@ def test_checkpoints_that_expand_are_refused_unread(write, files, tmp_path, monk
     assert type(error.value.__cause__) is ValueError
 
 
-def test_tensors_without_numbers_are_refused(files: Files, tmp_path: Path) -> None:
-    for tensor in (torch.zeros(3).to_sparse(), torch.zeros(3, device="meta")):
-        torch.save({"a": tensor}, tmp_path / "G.ckpt")
-        with pytest.raises(ModelError, match="not a state dictionary"):
-            import_official(tmp_path / "G.ckpt", files[1])
-
-
 def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     class Bomb:
         def __reduce__(self) -> tuple[object, tuple[Path]]:
@@ -256,7 +249,8 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(ModelError, match="not a PyTorch checkpoint, or damaged"):
             import_official(path, files[1])
-    for value in (torch.zeros(3), {"main.0.weight": 3}, {3: torch.zeros(1)}, ["main"], None):
+    without_numbers = {"a": torch.zeros(3).to_sparse()}, {"a": torch.zeros(3, device="meta")}
+    for value in (torch.zeros(3), {"main.0.weight": 3}, {3: torch.zeros(1)}, ["main"], None, *without_numbers):
         torch.save(value, path)
         with pytest.raises(ModelError, match="not a state dictionary"):
             import_official(path, files[1])
@@ -269,19 +263,10 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
             import_official(missing, files[1])
 
 
-# LI-Net. Weights: 1*64*7*7, 64*128*4*4, 128*256*4*4; 12 times 256*256*3*3; 256*128*4*4, 128*64*4*4, 64*1*7*7.
-LI_NET_WEIGHTS = 3_136 + 131_072 + 524_288 + 12 * 589_824 + 524_288 + 131_072 + 3_136
-# A scale and an offset for each normalised channel.
-LI_NET_NORMS = 2 * (64 + 128 + 256 + 12 * 256 + 128 + 64)
-# 2*16*9 + 16; dense block 16*16*9 + 16, 32*16*9 + 16; 48*48 + 48; dense block 48*16*9 + 16, 64*16*9 + 16;
-# 80*80 + 80; 80*16*16 * 128 + 128; 128*3 + 3.
-NE_NET = 304 + 2_320 + 4_624 + 2_352 + 6_928 + 9_232 + 6_480 + 2_621_568 + 387
-
-
 @pytest.mark.parametrize(
-    ("network", "expected", "published"),
-    [(PaperLINet(), LI_NET_WEIGHTS + LI_NET_NORMS, 8.40), (PaperNENet(2, 32), NE_NET, 2.65)],
+    ("network", "theirs", "published"),
+    [(PaperLINet(), AuthorsLINet(), 8.40), (PaperNENet(2, 32), AuthorsNENet(), 2.65)],
 )
-def test_the_published_number_of_parameters(network: nn.Module, expected: int, published: float) -> None:
-    assert sum(parameter.numel() for parameter in network.parameters()) == expected
-    assert expected / 1e6 == pytest.approx(published, abs=0.01)
+def test_the_published_number_of_parameters(network: nn.Module, theirs: nn.Module, published: float) -> None:
+    count, expected = (sum(parameter.numel() for parameter in one.parameters()) for one in (network, theirs))
+    assert count == expected and count / 1e6 == pytest.approx(published, abs=0.01)

@@ -92,9 +92,6 @@ def test_a_second_net_reads_the_results_of_the_first() -> None:
         torch.testing.assert_close(
             changed[:, channels(fit)] + normals, features[:, channels(fit)] + features[:, channels("normal")]
         )
-    rest = slice(channels("plain").stop, channels("error_median").start), slice(channels("largest").start, None)
-    for part in rest:
-        assert torch.equal(changed[:, part], features[:, part])
     found = both(features, mask, (slice(0, 8), slice(8, 16)))
     for part, whole in zip(found, both.again(changed * mask, mask), strict=True):
         torch.testing.assert_close(part, whole[..., :8, 8:], atol=1e-4, rtol=1e-4)

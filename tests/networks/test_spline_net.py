@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor
+from torch import Tensor, nn
 
 from splinecli.fits.least_squares import fit_lambertian
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.li_ne_net import error_negative_log_likelihood, probability_within
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.networks.config import STARTING_FITS, NetworkConfig, fit_normals
+from splinecli.networks.li_ne_net import MapEncoder, error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from tiny_networks import TINY, random_network
 
-PAPER = {"size": "paper", "map_size": 8}
 SET = {"set_width": 16, "set_layers": 2, "fits": ["ls"]}
 FLIP = torch.tensor((1.0, -1.0, 1.0))
 
@@ -34,18 +34,6 @@ def pixels() -> tuple[Tensor, Tensor]:
 def turn(vectors: Tensor, degrees: float) -> Tensor:
     angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
-
-
-@pytest.mark.parametrize("settings", [{}, SET, PAPER])
-def test_dense_map_ends_with_the_unit_disc(pixels: tuple[Tensor, Tensor], settings: dict[str, object]) -> None:
-    network = random_network(**settings)
-    with torch.no_grad():
-        dense = network.interpolate(network.build_maps(pixels[0].float(), pixels[1].float()))
-    size = network.config.map_size
-    assert dense.shape == (64, 1, size, size)
-    _, inside = cell_directions(size)
-    assert not dense[:, 0, ~inside].any()
-    assert (dense[:, 0, inside] != 0).float().mean() > 0.9
 
 
 def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels: tuple[Tensor, Tensor]) -> None:
@@ -156,3 +144,56 @@ def test_it_changes_no_normal() -> None:
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
     torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("n_maps", [1, 300])
+def test_few_products_give_the_features_of_the_convolutions(n_maps: int) -> None:
+    encoder = MapEncoder(3, 24, 2, 16)
+    for parameter in encoder.parameters():
+        nn.init.normal_(parameter, std=0.1)
+    maps = torch.rand(n_maps, 3, 16, 16)
+    with torch.no_grad():
+        found = encoder(maps)
+        expected = encoder.double()(maps.double())
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+NAMES = tuple(STARTING_FITS)
+
+
+def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each pixel."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(count, lights, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0))
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    observations = torch.rand(count, lights, generator=generator)
+    return observations / observations.amax(dim=1, keepdim=True), directions
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "iw12-all"])
+def test_they_are_the_methods_of_these_names(name: str) -> None:
+    observations, directions = draw_pixels(20, 12)
+    shared = directions[0]
+    expected = make_estimator(name, MethodOptions(device="cpu")).estimate(observations.numpy(), shared.double().numpy())
+    found = fit_normals([name], observations, shared)[:, 0]
+    torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_pixel_has_its_own_lights_and_their_number(name: str) -> None:
+    observations, directions = draw_pixels(9, 12)
+    count = torch.tensor([12, 11, 10, 9, 8, 7, 6, 5, 4])
+    valid = torch.arange(12) < count[:, None]
+    found = fit_normals([name], observations, directions, valid)
+    for pixel in range(9):
+        own = slice(0, int(count[pixel]))
+        alone = fit_normals([name], observations[pixel : pixel + 1, own], directions[pixel, own])
+        torch.testing.assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
+
+
+def test_pixels_that_no_fit_can_tell_anything_of() -> None:
+    directions = draw_pixels(1, 6)[1][0]
+    observations = torch.tensor([[0.0] * 6, [1.0] + [0.0] * 5, [-0.2] * 5 + [1.0]])
+    found = fit_normals(NAMES, observations, directions)
+    assert torch.isfinite(found).all()
+    assert not found[0].any()

@@ -74,6 +74,18 @@ def test_a_configuration_that_cannot_be(tmp_path: Path, config: str) -> None:
         load_weights(tmp_path / "odd.safetensors")
 
 
+class TensorsMade(TorchFunctionMode):
+    """Notes the elements of all tensors that functions of PyTorch return, but for those without memory."""
+
+    made: tuple[int, ...] = ()
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, Tensor) and not result.is_meta:
+            self.made += (result.numel(),)
+        return result
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -88,24 +100,9 @@ def test_a_configuration_far_larger_than_the_tensors(tmp_path: Path, settings: d
     network, path = random_network(), tmp_path / "a.safetensors"
     config = json.dumps({**network.config.to_dict(), **settings})
     write_like_splinecli(path, network, dict(network.state_dict()), config=config)
-    made: list[int] = []
-    with TensorsMade(made), pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"):
+    with TensorsMade() as tensors, pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"):
         load_weights(path)
-    assert max(made, default=0) < 1_000_000
-
-
-class TensorsMade(TorchFunctionMode):
-    """Notes the elements of all tensors that functions of PyTorch return, but for those without memory."""
-
-    def __init__(self, made: list[int]) -> None:
-        super().__init__()
-        self.made = made
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        if isinstance(result, Tensor) and not result.is_meta:
-            self.made.append(result.numel())
-        return result
+    assert max(tensors.made, default=0) < 1_000_000
 
 
 def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
@@ -175,3 +172,34 @@ def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"):
         load_weights(tmp_path / "a.safetensors")
+
+
+def test_round_trip_of_a_configuration() -> None:
+    paper = NetworkConfig(size="paper", map_size=16, width=5, grid="cnn-ps", interpolates=False)
+    for config in (paper, NetworkConfig(fits=("ia14", "ls"))):
+        assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"grid": "odd"}, "network setting 'grid' is 'odd'; expected 'even' or 'cnn-ps'"),
+        ({"grid": "cnn-ps"}, "network setting 'grid' is 'cnn-ps'; it needs the size 'paper'"),
+        ({"size": "huge"}, "network setting 'size' is 'huge'; expected 'paper' or 'compact'"),
+        ({"fits": ["cow"]}, r"'fits' has 'cow'; expected a list of ls, iw12, iw12-all, ia14"),
+        ({"size": "paper", "fits": ["ls"]}, "'fits' needs the size 'compact'"),
+        ({"interpolates": "no"}, "'interpolates' is 'no'; expected true or false"),
+        ({"width": 0}, "network setting 'width' is 0; expected a whole number from 2 to 4096"),
+        ({"ne_blocks": True}, "'ne_blocks' is True"),
+        ({"li_blocks": 5000}, "'li_blocks' is 5000"),
+        ({"sees_capture": True}, "'sees_capture' needs 'set_width'"),
+        ({"set_width": 20}, "'set_width' is 20; expected a multiple of 16"),
+        ({"size": "paper", "set_width": 16}, "'set_width' needs the size 'compact'"),
+        ({"map_size": 30}, "'map_size' is 30; expected a whole number from 8 to 128, a multiple of 4"),
+        ({"size": "paper", "error_head": True}, "'error_head' needs the size 'compact'"),
+        ({"map_size": 4096}, "'map_size' is 4096"),
+    ],
+)
+def test_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        NetworkConfig.from_dict(values)

@@ -29,12 +29,10 @@ def test_each_curve_leaves_out_what_was_not_computed() -> None:
     assert loss.get_yscale() == "linear"
 
 
-@pytest.mark.parametrize(("middle", "scale"), [(1.0, "log"), (0.0, "linear")])
-def test_wide_curves_are_logarithmic_unless_a_value_is_zero(middle: float, scale: str) -> None:
-    assert training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
-
-
-def test_without_a_li_net_the_map_errors_are_hidden() -> None:
+def test_scales_and_hidden_axes() -> None:
+    """Wide curves are logarithmic unless a value is zero; without a LI-Net, the map errors are hidden."""
+    for middle, scale in ((1.0, "log"), (0.0, "linear")):
+        assert training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
     columns = COLUMNS | {"map_error": [None] * 3, "masked_map_error": [None] * 3}
     assert [axes.get_visible() for axes in training_figure(columns).axes] == [True, True, False]
 

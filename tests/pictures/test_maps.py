@@ -37,15 +37,11 @@ def test_the_preview_is_brightest_where_the_surface_faces_the_light():
     assert picture[0].tolist() == [[255] * 3, [188] * 3, [0] * 3, [0] * 3]
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("shape", [(7, 5), (7, 5, 3)])
-def test_png_keeps_every_value(dtype, shape):
-    picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
-    stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
-
-
-def test_a_picture_that_cannot_be_encoded(monkeypatch):
+def test_png_keeps_every_value(monkeypatch):
+    for dtype, shape in ((np.uint8, (7, 5)), (np.uint16, (7, 5)), (np.uint8, (7, 5, 3)), (np.uint16, (7, 5, 3))):
+        picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+        stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
     with pytest.raises(OutputError, match="cannot be encoded as PNG"):
         encode_png(np.zeros((2, 2), np.uint8))
@@ -64,7 +60,7 @@ def test_known_errors_have_known_colours() -> None:
     assert (colours[0, 4] == 255).all()
 
 
-def test_a_small_map_is_enlarged_pixel_by_pixel() -> None:
+def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels() -> None:
     errors = np.full((60, 50), np.nan, np.float32)
     errors[10:20, 30:40] = 30
     picture = error_map_picture(errors)
@@ -72,9 +68,6 @@ def test_a_small_map_is_enlarged_pixel_by_pixel() -> None:
     square = np.zeros((300, 250), bool)
     square[50:100, 150:200] = True
     np.testing.assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
-
-
-def test_a_large_map_keeps_its_pixels() -> None:
     errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
     picture = error_map_picture(errors)
     assert picture.shape[0] == 400

@@ -26,7 +26,6 @@ from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-
 GB = 10**9
 
 
@@ -182,17 +181,6 @@ def test_the_cores_are_shared_out(monkeypatch, work):
         assert run(client, work(worker_tasks.threads), numbered(range(1))) == {0: "2"}
 
 
-def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
-    call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls"]
-    assert main([*call, "-o", "out", "-q"]) == 0
-    expected = results_in("out")
-    Path("out").rename("alone")
-    assert main([*call, "-o", "out", "--workers", "2"]) == 0
-    assert results_in("out") == expected
-    out, err = capfd.readouterr()
-    assert out.count("\n") == 4 and err.endswith("4 captures: 4 done; see out/index.html\n")
-
-
 def test_shards_side_by_side_share_a_folder(cluster, tmp_path, capfd):
     """Another batch that writes the index of the folder leaves the mark by which workers know it."""
     call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls", "-o", "out"]
@@ -214,24 +202,15 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     assert not Path("out").exists()
 
 
-def test_a_folder_that_cannot_be_written_does_not_end_the_batch(cluster, tmp_path, monkeypatch):
-    folders = [Path(name) for name in write_captures(["a", "b"])]
-    Path("out").mkdir()
-    Path("out/a").write_text("a file")
-    options = ClusterOptions(address=cluster.scheduler_address)
-    outcomes = infer_batch(folders, InferOptions(method="ls"), cluster=options)
-    found = {outcome.report["capture"]: (outcome.status, outcome.exit_code) for outcome in outcomes}
-    assert found == {"a": ("failed", 5), "b": ("done", 0)}
-
-
-@pytest.mark.parametrize(
-    "address", ["tcp://127.0.0.1:1", "strange://x", "http://x", "none.json", "broken.json", "tcp://"]
-)
-def test_no_scheduler(address, tmp_path, monkeypatch):
+def test_no_scheduler(monkeypatch):
     Path("broken.json").write_text("{}")
     monkeypatch.setattr(distribution_module, "_CONNECT_SECONDS", 0.2)
-    with pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"):
-        distribution_module.connected(ClusterOptions(address=address)).__enter__()
+    monkeypatch.setattr(distribution_module, "_ANSWER_SECONDS", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # no scheduler
+        addresses = ["tcp://127.0.0.1:1", "strange://x", "http://x", "none.json", "broken.json", "tcp://"]
+        for address in (*addresses, f"tcp://127.0.0.1:{server.getsockname()[1]}"):
+            with pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"):
+                distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
@@ -240,14 +219,6 @@ def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
-
-
-def test_a_server_that_is_no_scheduler(monkeypatch):
-    monkeypatch.setattr(distribution_module, "_ANSWER_SECONDS", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(UsageError, match="no Dask scheduler answers"):
-            distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):

@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -13,7 +13,10 @@ from splinecli.capture import Capture
 from splinecli.errors import UsageError
 from splinecli.methods.estimator import LeastSquares, StudentSize
 from splinecli.pipeline import infer
-from splinecli.pipeline.infer import AUTOMATIC_FROM, distil_for
+from splinecli.pipeline.infer import AUTOMATIC_FROM, REFINED_PIXELS, distil_for
+from splinecli.pipeline.info import ORIGINS
+from splinecli.refinement.refiner import MARGIN, TILE
+from splinecli.restoration.images import Origin
 
 LIGHTS = spiral_lights(6, 40)
 
@@ -89,3 +92,11 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network() -> None:
     with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil"):
         distil_for(dark, Slow(), True)
     assert distil_for(dark, Slow(), None) == (None, [])
+
+
+def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
+    assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
+
+
+def test_every_origin_of_a_white_level_has_words() -> None:
+    assert ORIGINS.keys() == set(get_args(Origin))

@@ -59,17 +59,6 @@ def test_all_pixels_have_the_same_probability(make_set: MakeSet) -> None:
     assert of_b.sum(axis=0) == pytest.approx(np.full(30, 100), abs=4 * np.sqrt(100))
 
 
-def test_as_many_lights_as_configured(make_set: MakeSet) -> None:
-    source = source_of(make_set())
-    batches = [source.draw(20) for _ in range(60)]
-    counts = torch.cat([batch.valid.sum(dim=1) for batch in batches])
-    assert counts.min() == 5
-    assert counts.max() == 10
-    assert {batch.valid.shape[1] for batch in batches} == {5, 6, 7, 8, 9, 10}
-    usual = replace(FAULTLESS, min_lights=8, max_lights=8)
-    assert (source_of(make_set("other"), usual).draw(50).valid.sum(dim=1) == 8).all()
-
-
 def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeSet) -> None:
     pixel_set = make_set(entries=[("a", "one", 20, 6), ("b", "two", 20, 12)])
     config = replace(FAULTLESS, min_lights=20, max_lights=20, usual_lights=20)
@@ -132,45 +121,6 @@ def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) ->
     error = ((dense.values - analytic) * filled).abs()
     assert error.sum() / filled.sum() < 0.02
     assert error[..., cell_directions()[0][..., 2] > 0.5].max() < 2 / 16
-
-
-def test_any_rotation_puts_each_light_into_its_cell() -> None:
-    scene, _ = analytic_scene(3)
-    known = torch.rand(scene.known.shape, generator=seeded(1)) < 0.3
-    scene = SampledPixels(scene.normals, scene.radiance, scene.light_directions, known)
-    angle = torch.tensor([0.3, -1.1, 2.5])
-    dense = scene.rotate(angle.cos(), angle.sin()).dense_truth(32)
-    for pixel in range(3):
-        found: dict[tuple[int, int], list[float]] = {}
-        cosine, sine = angle[pixel].cos().item(), angle[pixel].sin().item()
-        for light in known[pixel].nonzero()[:, 0]:
-            x, y, _ = scene.light_directions[pixel, light].tolist()
-            column = int((cosine * x - sine * y + 1) * 16)
-            row = int((1 - (sine * x + cosine * y)) * 16)
-            found.setdefault((row, column), []).append(scene.radiance[pixel, light].item())
-        inside = cell_directions()[1]
-        expected = {cell: np.mean(values) for cell, values in found.items() if inside[cell]}
-        assert {tuple(cell) for cell in dense.known[pixel, 0].nonzero().tolist()} == set(expected)
-        for cell, value in expected.items():
-            assert dense.values[pixel, 0][cell].item() == pytest.approx(value, abs=1e-6)
-
-
-def test_linear_maps_are_filled_about_right_and_known_cells_stay() -> None:
-    directions, inside = cell_directions()
-    linear = (0.5 + 0.3 * directions[..., 0] - 0.2 * directions[..., 1])[None, None]
-    disc = inside.float()[None, None]
-    known = (torch.rand(1, 1, 32, 32, generator=seeded()) < 0.4).float() * disc
-    dense = fill_gaps(linear * known, known, inside)
-    assert torch.equal(dense.known, known)
-    assert torch.equal(dense.values * known, linear * known)
-    # All but the rim, whose cells have neighbours on one side alone.
-    within = disc * (directions[..., 2] > 0.35)
-    assert (dense.filled * within).sum() > 0.85 * within.sum()
-    assert (dense.filled * (1 - disc)).sum() == 0
-    # The slope along a row or column is at most 0.3 / 16 a cell, and neighbours are asked first.
-    error = ((dense.values - linear) * dense.filled).abs()
-    assert error.max() < 2 * 0.5 / 16
-    assert error.sum() / disc.sum() < 0.3 * 0.3 / 16
 
 
 def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:

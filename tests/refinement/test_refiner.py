@@ -21,7 +21,6 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.refine_net import RefineNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.refinement import refiner
 from splinecli.refinement.refiner import NetworkRefiner
 from tiny_networks import TINY
 
@@ -108,34 +107,6 @@ def test_a_turned_capture_gets_turned_normals() -> None:
 
     # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them in this test.
     np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
-
-
-def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Near lamps give each pixel its own frame. Blocks of pixels are turned back as all pixels at once."""
-    rng = np.random.default_rng(4)
-    normals = unit(rng.normal((0, 0, 3), 1, (900, 3))).astype(np.float32)
-    observations = (normals @ LIGHTS.T).clip(0).astype(np.float32)
-    turns = np.linalg.qr(rng.normal(size=(900, 3, 3)))[0].astype(np.float32)
-    net = lively(RefineNet())
-    asked: list[int] = []
-
-    def refined(turned: bool) -> NDArray[np.float32]:
-        def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
-            asked.append(len(rows))
-            return PixelLighting(observations[rows], LIGHTS, turns[rows] if turned else None)
-
-        found, errors = normals.copy(), np.tile(np.float32((-3, 1)), (900, 1))
-        NetworkRefiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, lighting_at, found, errors)
-        return found
-
-    at_once = refined(True)
-    asked.clear()
-    monkeypatch.setattr(refiner, "LIT_AT_ONCE", 200)
-    np.testing.assert_allclose(refined(True), at_once, atol=1e-5)
-    assert asked == [1] + 2 * [200, 200, 200, 200, 100]
-    asked.clear()
-    refined(False)
-    assert sum(asked) == 1 + 900 + 200  # in one frame for all pixels, nothing is turned back
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:

@@ -112,8 +112,6 @@ def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
     monkeypatch.setattr(mesh_module, "LARGE_MAP", 0)
     surface, normal_map = dome(camera, odd)
     mask = surface[1]
-    blocks = mesh_module._mesh_of_blocks(*surface, 300, normal_map, None)
-    assert blocks is not None and 4 * 300 <= len(blocks.triangles) < np.count_nonzero(mask)
     mesh = decimated_mesh(*surface, n_triangles=300, normal_map=normal_map)
     assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)
     columns, rows = (mesh.uvs * mask.shape[::-1] - 0.5).T

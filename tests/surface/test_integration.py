@@ -90,14 +90,6 @@ def test_sphere(reach: float, limit: float, discontinuity: float) -> None:
     assert found[mask].mean() == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("slope", [0.3, 10.0])
-def test_tent(slope: float) -> None:
-    x, _ = grid(60, 90)
-    found = integrate_normals(normals_of_slopes(-slope * np.sign(x), 0 * x), np.ones(x.shape, bool))
-    # The ridge lies between two pixels, whose equations are off by the same in both directions.
-    assert error_share(found, -slope * np.abs(x), np.ones(x.shape, bool)) < 1e-6
-
-
 def levels(rows: int, columns: int, height: float, slope: float, joined: int) -> tuple[Floats, Floats, Mask]:
     """Return normals and heights of two flat levels, and the mask of the wall between them.
 
@@ -181,16 +173,6 @@ def test_perspective_sphere() -> None:
     assert (found[mask] > 0).all()
     assert np.exp(np.log(found[mask]).mean()) == pytest.approx(1, rel=1e-9)
     assert error_share(found * scale, depth, mask) < 5e-3
-
-
-@pytest.mark.usefixtures("any_scale")
-def test_a_camera_far_away_is_orthographic() -> None:
-    normals, mask, truth = sphere(60, 80, 40, 0.8)
-    focal = 1e6
-    camera = np.array([[focal, 0, 39.5], [0, focal, 29.5], [0, 0, 1]])
-    # So far away that one pixel of width is one of depth, in units of depth / focal.
-    found = -focal * np.log(integrate_normals(normals, mask, camera_matrix=camera))
-    assert error_share(found, truth, mask) < 5e-4
 
 
 def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
@@ -281,13 +263,13 @@ def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> 
     assert abs(np.mean(both - heights)) < 0.1
 
 
-@pytest.mark.parametrize("factor", [-1.0, 20.0, 0.01])
-def test_a_prior_in_another_direction_or_unit(factor: float) -> None:
+def test_a_prior_in_another_direction_or_unit() -> None:
     normals, heights, _ = drifting()
-    with pytest.raises(InputError, match="the slopes of the prior are") as raised:
-        integrate_normals(normals, prior=factor * heights)
-    stated = re.search(r"are (\S+) times", str(raised.value))
-    assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
+    for factor in (-1.0, 20.0, 0.01):
+        with pytest.raises(InputError, match="the slopes of the prior are") as raised:
+            integrate_normals(normals, prior=factor * heights)
+        stated = re.search(r"are (\S+) times", str(raised.value))
+        assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
 
 
 @pytest.mark.usefixtures("until_nothing_moves")
@@ -322,30 +304,22 @@ def test_backward_normals_are_bridged() -> None:
 
 
 @pytest.mark.usefixtures("until_nothing_moves")
-@pytest.mark.parametrize("quarters", [1, 2])
-def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
+def test_turning_the_picture_turns_the_surface() -> None:
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
     x, y, z = np.moveaxis(normals, -1, 0)
-    for _ in range(quarters):
-        x, y = -y, x
     found = integrate_normals(normals, mask)
-    again = integrate_normals(np.rot90(np.stack((x, y, z), axis=-1), quarters), np.rot90(mask, quarters))
-    np.testing.assert_allclose(again, np.rot90(found, quarters), atol=5e-3)
+    again = integrate_normals(np.rot90(np.stack((-y, x, z), axis=-1)), np.rot90(mask))
+    np.testing.assert_allclose(again, np.rot90(found), atol=5e-3)
 
 
-def test_inputs_do_not_change_and_progress_is_reported() -> None:
+def test_without_a_mask_all_normals_count_and_progress_is_reported() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     kept, calls = normals.copy(), []
-    integrate_normals(normals, mask, discontinuity=0, progress=calls.append)
+    expected = integrate_normals(normals, mask, discontinuity=0, progress=calls.append)
     assert np.array_equal(normals, kept) and calls == [1.0]
-
-
-@pytest.mark.parametrize("background", [0.0, np.nan])
-def test_without_a_mask_all_normals_count(background: float) -> None:
-    normals, mask, _ = sphere(40, 50, 30, 0.9)
-    expected = integrate_normals(normals, mask)
-    found = integrate_normals(np.where(mask[..., None], normals, background))
-    np.testing.assert_array_equal(found, expected)
+    for background in (0.0, np.nan):
+        found = integrate_normals(np.where(mask[..., None], normals, background), discontinuity=0)
+        np.testing.assert_array_equal(found, expected)
 
 
 NORMALS = np.tile((0.0, 0.0, 1.0), (3, 4, 1))

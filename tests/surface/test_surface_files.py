@@ -28,14 +28,15 @@ def encode(mesh: SurfaceMesh, form: str, *, unit: str = "pixel", millimetres: fl
     return dict(encode_surface(Surface(DEPTH, mesh, unit, millimetres), [form]))
 
 
-def load(content: bytes, form: str, **more: Any) -> Any:
-    options: dict[str, Any] = {"process": False, "maintain_order": True, **more}
-    return trimesh.load_mesh(io.BytesIO(content), file_type=form, **options)
+def load(content: bytes, form: str) -> Any:
+    return trimesh.load_mesh(io.BytesIO(content), file_type=form, process=False, maintain_order=True)
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_ply(coloured: bool) -> None:
+def test_ply_and_stl(coloured: bool) -> None:
     mesh = wave(coloured)
+    stl = load(encode(mesh, "stl")["mesh.stl"], "stl")
+    np.testing.assert_array_equal(stl.triangles, mesh.vertices[mesh.triangles])
     content = encode(mesh, "ply")["mesh.ply"]
     read = load(content, "ply")
     np.testing.assert_array_equal(read.vertices, mesh.vertices)
@@ -50,11 +51,6 @@ def test_ply(coloured: bool) -> None:
     assert read.visual.kind == ("vertex" if coloured else None)
     if coloured:
         np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], COLOURS.reshape(-1, 3))
-
-
-def test_stl() -> None:
-    mesh = wave()
-    np.testing.assert_array_equal(load(encode(mesh, "stl")["mesh.stl"], "stl").triangles, mesh.vertices[mesh.triangles])
 
 
 @pytest.mark.parametrize("coloured", [False, True])

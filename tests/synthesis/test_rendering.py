@@ -11,6 +11,7 @@ from torch import Tensor
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
+from point_lights import render_point_lights
 from splinecli.synthesis import rendering
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -120,6 +121,22 @@ def test_a_wall_casts_its_shadow() -> None:
     # Behind the wall, it is the other way round.
     behind = (x > 0.2 + 0.04) & (x < 0.6 - 0.04)
     assert np.abs(direct[behind, 1]).max() == 0
+
+
+def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() -> None:
+    """The cosine is h / d and the falloff (d0 / d)^2, so the radiance is albedo h d0^2 / d^3."""
+    tracer = Tracer(floor_with_wall())
+    visible = find_visible_surface(tracer, 50, 1)
+    lamps = np.array([(-2.0, 0.3, 1.0), (-0.8, 1.2, 3.0), (1.5, -0.4, 0.9)])
+    found = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(4, np.int64))["matte"].numpy()
+    points = visible.samples.position
+    distance = np.linalg.norm(lamps - points[:, None], axis=2)
+    expected = 0.7 * lamps[:, 2] * np.linalg.norm(lamps, axis=1) ** 2 / distance**3
+    share = (0.2 - points[:, :1]) / (lamps[:, 0] - points[:, :1])  # of the ray to the lamp, where it passes x = 0.2
+    clear = ~((share > 0) & (share * lamps[:, 2] < 0.4))
+    sure = (np.abs(share * lamps[:, 2] - 0.4) > 0.02) & (np.abs(points[:, 1:2]) < 0.8)  # the wall ends at 1
+    np.testing.assert_allclose(found[sure], (expected * clear)[sure], rtol=1e-5)
+    assert 0.1 < clear[sure].mean() < 0.95
 
 
 @pytest.mark.parametrize("bounces", [1, 4])

@@ -1,21 +1,16 @@
 """Scenes: reproducible one by one, and drawn from the stated ranges."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import CLASSES, draw_material, with_one_gloss
 from splinecli.synthesis.scenes import (
     MATERIALS,
     MIN_LIGHT_Z,
     SceneConfig,
     draw_lights,
-    draw_patches,
     draw_scene,
     render_scene,
 )
@@ -70,30 +65,3 @@ def test_lights_cover_the_upper_hemisphere() -> None:
     probes[:, 2] = np.abs(probes[:, 2])
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12
-
-
-def test_patches_of_one_gloss_differ_in_their_base_alone() -> None:
-    material = with_one_gloss(draw_material(50, torch.Generator().manual_seed(0), CLASSES["specular"]))
-    for field in fields(material):
-        values = getattr(material, field.name)
-        assert values.shape == (50, 1)
-        assert (len(values.unique()) > 1) == (field.name == "base"), field.name
-
-
-def test_patches_are_connected_areas_of_about_one_size() -> None:
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.arange(31), np.arange(31)), axis=-1).reshape(-1, 2) / 15 - 1
-    vertices = np.column_stack((grid, np.zeros(len(grid)))).astype(np.float32)
-    corner = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
-    faces = np.concatenate(
-        (np.stack((corner, corner + 1, corner + 32), 1), np.stack((corner, corner + 32, corner + 31), 1))
-    )
-    mesh = Mesh(vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1)))
-    patches = draw_patches(mesh, 20, rng)
-    assert patches.shape == (1800,) and set(np.unique(patches)) <= set(range(20))
-    centres = vertices[faces].mean(axis=1)
-    for patch in np.unique(patches):
-        here = centres[patches == patch]
-        # Voronoi cells are convex: their middle belongs to them, or to the face next to it.
-        middle = np.linalg.norm(centres - here.mean(axis=0), axis=1).argsort()[:6]
-        assert (patches[middle] == patch).any()

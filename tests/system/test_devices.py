@@ -1,25 +1,14 @@
-"""Devices, precision and threads."""
+"""Devices, precision, threads, memory and optional packages."""
 
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from splinecli.errors import UsageError
-from splinecli.system import machine as machine_module
-from splinecli.system.machine import (
-    available_memory,
-    cgroup_quotas,
-    choose_device,
-    choose_precision,
-    count_available_cores,
-    use_available_cores,
-)
-
-
-def test_unknown_device() -> None:
-    with pytest.raises(UsageError, match="no device named 'gpu'; expected auto, cpu or cuda"):
-        choose_device("gpu")
+from splinecli.system import machine
+from splinecli.system.machine import available_memory, cgroup_quotas, choose_device, choose_precision, import_extra
 
 
 @pytest.mark.parametrize(
@@ -31,10 +20,13 @@ def test_choice(monkeypatch: pytest.MonkeyPatch, name: str, available: bool, cho
     assert choose_device(name).type == chosen
 
 
-def test_cuda_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "problem"), [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")]
+)
+def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch, name: str, problem: str) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(UsageError, match="no CUDA device was found"):
-        choose_device("cuda")
+    with pytest.raises(UsageError, match=problem):
+        choose_device(name)
 
 
 def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions() -> None:
@@ -54,8 +46,8 @@ def write(path: Path, text: str) -> None:
 @pytest.fixture
 def mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of control groups, beside the file `groups` that says in which ones this process is."""
-    monkeypatch.setattr(machine_module, "_GROUPS", tmp_path / "groups")
-    monkeypatch.setattr(machine_module, "_MOUNT", tmp_path / "mount")
+    monkeypatch.setattr(machine, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(machine, "_MOUNT", tmp_path / "mount")
     return tmp_path / "mount"
 
 
@@ -63,22 +55,15 @@ def enter(mount: Path, groups: str) -> None:
     write(mount.parent / "groups", groups)
 
 
+V1 = "cpu,cpuacct"
 QUOTAS = {
-    "version 2": (
-        "0::/jobs/ours\n",
-        {"cpu.max": "max 1", "jobs/cpu.max": "3 1", "jobs/ours/cpu.max": "4 1"},
-        [3, 4],
-    ),
+    "version 2": ("0::/jobs/ours\n", {"cpu.max": "max 1", "jobs/cpu.max": "3 1", "jobs/ours/cpu.max": "4 1"}, [3, 4]),
     "the top": ("0::/\n", {"cpu.max": "max 100000\n", "jobs/cpu.max": "300000 100000\n"}, []),
     "a container that shows the host's path": ("0::/docker/0123abcd\n", {"cpu.max": "150000 100000\n"}, [1.5]),
     "version 1": (
         "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n",
-        {
-            "cpu,cpuacct/cpu.cfs_quota_us": "-1\n",
-            "cpu,cpuacct/cpu.cfs_period_us": "100000\n",
-            "cpu,cpuacct/box/cpu.cfs_quota_us": "50000\n",
-            "cpu,cpuacct/box/cpu.cfs_period_us": "100000\n",
-        },
+        {f"{V1}/cpu.cfs_quota_us": "-1\n", f"{V1}/cpu.cfs_period_us": "100000\n"}
+        | {f"{V1}/box/cpu.cfs_quota_us": "50000\n", f"{V1}/box/cpu.cfs_period_us": "100000\n"},
         [0.5],
     ),
 }
@@ -97,8 +82,8 @@ def test_quotas_of_control_groups(mount: Path, case: str) -> None:
 
 def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A job of Slurm or systemd is in a group within groups. Each of them may have a limit."""
-    monkeypatch.setattr(machine_module, "_free_memory", lambda: 9e9)
-    monkeypatch.setattr(machine_module, "_left_in_address_space", lambda: 8e9)
+    monkeypatch.setattr(machine, "_free_memory", lambda: 9e9)
+    monkeypatch.setattr(machine, "_left_in_address_space", lambda: 8e9)
     assert available_memory() == 8e9
     enter(mount, "0::/jobs/ours\n")
     write(mount / "jobs/ours/memory.max", "max\n")
@@ -111,8 +96,8 @@ def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_module, "_free_memory", lambda: 8e9)
-    monkeypatch.setattr(machine_module, "_left_in_address_space", lambda: 9e9)
+    monkeypatch.setattr(machine, "_free_memory", lambda: 8e9)
+    monkeypatch.setattr(machine, "_left_in_address_space", lambda: 9e9)
     enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
     for group, limit in (("", 9223372036854771712), ("box", 5000), ("box/ours", 9223372036854771712)):
         write(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
@@ -124,14 +109,14 @@ def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    ("machine", "affinity", "quotas", "expected"),
+    ("cores", "affinity", "quotas", "expected"),
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
-def test_available_cores(machine, affinity, quotas, expected, monkeypatch):
-    monkeypatch.setattr(machine_module.os, "cpu_count", lambda: machine)
-    monkeypatch.setattr(machine_module.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
-    monkeypatch.setattr(machine_module, "cgroup_quotas", lambda: quotas)
-    assert count_available_cores() == expected
+def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
+    monkeypatch.setattr(machine.os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+    monkeypatch.setattr(machine, "cgroup_quotas", lambda: quotas)
+    assert machine.count_available_cores() == expected
 
 
 @pytest.mark.parametrize(("threads", "cores", "expected"), [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
@@ -139,6 +124,19 @@ def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     now = [threads]
     monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
     monkeypatch.setattr(torch, "set_num_threads", lambda count: now.__setitem__(0, count))
-    monkeypatch.setattr(machine_module, "count_available_cores", lambda: cores)
-    use_available_cores()
+    monkeypatch.setattr(machine, "count_available_cores", lambda: cores)
+    machine.use_available_cores()
     assert now[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "named"),
+    [
+        ("embreex.rtcore_scene", "render", "embreex and scikit-image"),
+        ("fast_simplification", "mesh", "fast-simplification"),
+    ],
+)
+def test_the_message_names_the_packages_and_the_command(module, extra, named, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=rf"{named}.*Run pip install 'splinecli\[{extra}\]'"):
+        import_extra(module, extra)

@@ -13,16 +13,13 @@ def names_in(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 
 
-def test_writes_into_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
-    write_text(tmp_path / "a" / "b" / "out.txt", "déjà vu\n")
-    assert (tmp_path / "a" / "b" / "out.txt").read_bytes() == "déjà vu\n".encode()
-    assert names_in(tmp_path / "a" / "b") == ["out.txt"]
-
-
-def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
+def test_a_new_file_in_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
-    write_bytes(tmp_path / "written", b"")
-    assert (tmp_path / "written").stat().st_mode == (tmp_path / "plain").stat().st_mode
+    path = tmp_path / "a" / "b" / "out.txt"
+    write_text(path, "déjà vu\n")
+    assert path.read_bytes() == "déjà vu\n".encode()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+    assert names_in(path.parent) == ["out.txt"]
 
 
 def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

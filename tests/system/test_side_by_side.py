@@ -35,8 +35,7 @@ def test_results_come_in_order_and_parts_run_at_the_same_time(threads: int) -> N
 
 def test_few_results_wait(threads: int) -> None:
     begun: list[int] = []
-    results = side_by_side(begun.append, range(100))
-    for done, _ in enumerate(results, 1):
+    for done, _ in enumerate(side_by_side(begun.append, range(100)), 1):
         assert len(begun) <= done + threads
 
 

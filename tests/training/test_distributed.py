@@ -8,13 +8,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 
 from splinecli.networks.weights import load_weights
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import METRICS
-from splinecli.training.distributed import Workers, is_launched, join_workers, restarts_are_allowed
 from splinecli.training.loop import WEIGHTS, Trainer
 from splinecli.training.run_files import read_metrics
 
@@ -31,17 +29,6 @@ def free_port() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return str(probe.getsockname()[1])
-
-
-def test_alone_nothing_is_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("WORLD_SIZE", "TORCHELASTIC_RUN_ID", "TORCHELASTIC_MAX_RESTARTS"):
-        monkeypatch.delenv(name, raising=False)
-    assert not is_launched()
-    assert not restarts_are_allowed()
-    assert join_workers(CPU) == (Workers(0, 1), CPU)
-    numbers = torch.ones(6)
-    assert Workers().average([], numbers) is numbers
-    assert Workers().agree(1 / 3, CPU) == 1 / 3
 
 
 WORKER = """

@@ -139,15 +139,9 @@ def test_a_second_refinement_net_follows_one_that_is_trained(refining: TrainingC
     assert not torch.equal(found.out.weight, first.out.weight), "both learn together"
     with pytest.raises(ModelError, match="with refines_twice = True, the run's has False"):
         Trainer(replace(refining, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
-
-
-def test_a_second_refinement_net_needs_a_first(refining: TrainingConfig, tmp_path: Path) -> None:
-    without = SplineNet(replace(refining.network, refines=False))
-    save_weights(without, tmp_path / "without.safetensors")
-    network = replace(refining.network, refines_twice=True)
-    twice = replace(refining, network=network, start_from=str(tmp_path / "without.safetensors"))
+    save_weights(SplineNet(replace(refining.network, refines=False)), tmp_path / "without.safetensors")
     with pytest.raises(ModelError, match="no refinement net"):
-        Trainer(twice, tmp_path / "run", CPU)
+        Trainer(replace(twice, start_from=str(tmp_path / "without.safetensors")), tmp_path / "run", CPU)
 
 
 def test_the_preset_continues_the_weights_that_it_starts_from() -> None:
@@ -198,20 +192,6 @@ def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monke
     for task in (whole, rest):
         task.pool.add()
     assert torch.equal(whole.pool.examples[-1].features, rest.pool.examples[-1].features)
-
-
-def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
-    network = network_of(refining)
-    pool = ScenePool([(bumpy_set, bumpy_set.entries, 1.0)], network, refining.pixels, 1)
-    pool.add()
-    maps = stack_maps(pool.examples)
-    normals = maps.normals.clone()
-    normals[..., 7:] = 0
-    mask = maps.mask.clone()
-    mask[..., 7:] = False
-    # An untrained net changes nothing, so what lies beside a pixel does not matter.
-    half = refinement_losses(network, maps._replace(mask=mask, normals=normals))
-    torch.testing.assert_close(refinement_losses(network, maps._replace(normals=normals)), half)
 
 
 def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:

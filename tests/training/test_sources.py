@@ -92,15 +92,10 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     pixel_set = make_set()
     config = replace(tiny, sources={str(pixel_set.folder): 1.0, GENERATOR: 3.0})
 
-    def draw(seed: int, count: int) -> tuple[list[PixelBatch], list[PixelBatch]]:
-        source, held = open_sources(config, seed)
-        return [source.draw(5) for _ in range(count)], [held.draw(5) for _ in range(count // 4)]
-
-    (training, validation), again = draw(5, 60), draw(5, 8)
-    for batches, others in ((training, again[0]), (validation, again[1])):
-        for batch, other in zip(batches[: len(others)], others, strict=True):
-            assert all(map(torch.equal, parts(batch), parts(other)))
-    assert not torch.equal(draw(6, 1)[0][0].truth.normals, training[0].truth.normals)
+    source, held = open_sources(config, 5)
+    training, validation = [source.draw(5) for _ in range(60)], [held.draw(5) for _ in range(15)]
+    again = open_sources(config, 5)[0].draw(5)
+    assert all(map(torch.equal, parts(training[0]), parts(again)))
     for_validation = {entry.name for entry in split_scenes(pixel_set.entries, config.held_share)[1]}
     stored = rows_of(pixel_set, *({"a", "b", "c"} - for_validation))
     # A batch has one source. The set gives a quarter of the batches.

@@ -17,15 +17,7 @@ import cv2
 import numpy as np
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
-from splinecli.capture.files import (
-    MASK,
-    NOT_PHOTOGRAPHS,
-    choose_mask,
-    find_images,
-    find_named,
-    is_mask_name,
-    list_images,
-)
+from splinecli.capture import files as capture_files
 from splinecli.capture.formats.facts import ImageHeader, read_header
 from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
 from splinecli.capture.near_lamps import read_camera_matrix
@@ -36,14 +28,8 @@ from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 
 DISTANT = 1e6  # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly parallel
-
-SHORTEST_LENS = 0.7
-"""Shortest usual focal length, in longer sides of the image. Telephones have it: 25 mm for 36 mm of film."""
-
-
-_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
-_MILLIMETRES = {2: 25.4, 3: 10.0}
-_FILM_DIAGONAL = math.hypot(36, 24)
+SHORTEST_LENS = 0.7  # of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405  # tags of EXIF
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +46,14 @@ class View:
 
     def draw(self, generator: np.random.Generator) -> Float64Array:
         """Return a matrix (3, 3) that may be the true one."""
-        factor = 1.0
+        matrix = self.matrix.copy()
         if not self.known:
             # All rays of sight from parallel ones to the shortest lens, evenly.
-            nearest = self.shortest / float(self.matrix[0, 0])
-            factor = nearest / generator.uniform(nearest, 1)
+            nearest = self.shortest / float(matrix[0, 0])
+            matrix[:2, :2] *= nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
             # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing changes them.
-            factor = math.exp(0.05 * generator.normal())
-        matrix = self.matrix.copy()
-        matrix[:2, :2] *= factor
+            matrix[:2, :2] *= math.exp(0.05 * generator.normal())
         return matrix
 
 
@@ -95,18 +79,19 @@ def find_view(image: ImageHeader, matrix: Path | None) -> View:
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
     """Return the focal length in pixels from EXIF tags; None if they do not contain it."""
+    millimetres = {2: 25.4, 3: 10.0}  # of an inch and of a centimetre, by EXIF's numbers of units
     try:
-        if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
-            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
+        if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in millimetres:
+            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / millimetres[tags.get(_UNIT, 2)]
             pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
         else:
-            pixels = float(tags[_FILM]) / _FILM_DIAGONAL * math.hypot(width, height)
+            pixels = float(tags[_FILM]) / math.hypot(36, 24) * math.hypot(width, height)
     except Exception:  # damaged tags cause a dozen types of errors
         return None
     return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
 
 
-HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
+_HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
 
 
 @dataclass(frozen=True)
@@ -121,12 +106,11 @@ class Highlight:
 def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
     """Return the highlight of the lamp in the ball: the weighted centroid of its brightest patch.
 
+    Raises InputError if the ball shows no highlight, or its brightest patch is too wide for a lamp.
+
     Args:
         image: (H, W), linear gray values.
         full_scale: the value at which pixels saturate. None for images that do not saturate.
-
-    Raises:
-        InputError: the ball shows no highlight, or its brightest patch is too wide for a lamp.
     """
     inside = circle.inside(image.shape)
     values = np.where(inside, image, 0).astype(np.float32)
@@ -134,12 +118,9 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
     if brightest <= 4.0 * median or brightest <= 0:  # smallest ratio of the highlight to the median of the ball
-        raise InputError(
-            "found no highlight in the ball",
-            hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
-            " lamp must be by far the brightest spot in the ball",
-        )
-    _, labels = cv2.connectedComponents((smooth >= HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
+        hint = "Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the lamp"
+        raise InputError("found no highlight in the ball", hint=f"{hint} must be by far the brightest spot in the ball")
+    _, labels = cv2.connectedComponents((smooth >= _HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
     # Of several patches, take the one with the most light rather than the one with the brightest pixel.
     light = np.bincount(labels.ravel(), weights=smooth.ravel())
     light[0] = 0
@@ -150,7 +131,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
         problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
         raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
-    weight = smooth[core].astype(np.float64) - 0.9 * HIGHLIGHT_LEVEL * brightest
+    weight = smooth[core].astype(np.float64) - 0.9 * _HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
     return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
 
@@ -183,17 +164,8 @@ def reflect(centre: Float64Array, highlights: Float64Array, matrix: Float64Array
     return normals, rays - 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
 
 
-def check_in_front(direction: Float64Array, ray: Float64Array) -> None:
-    """Raise InputError if a light direction (3,) is level with the ball or behind it, as viewed from the camera."""
-    if not direction @ ray < 0:
-        problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
-        raise InputError(problem, hint="Place all lights on the camera's side of the object")
-
-
 REFERENCES = ("ref", "reference")
 """Names, without suffix, of an image that shows the outline of the ball and belongs to no light."""
-
-_NOT_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,12 +216,14 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
 
     A mask that is given replaces the one in the folder. Raises InputError if the folder has no images.
     """
-    images, listed = find_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
-    if not listed and 2 * sum(map(is_mask_name, images)) < len(images):  # such as chrome.mask.tga
-        images = tuple(image for image in images if not is_mask_name(image))
-    others = list_images(folder, leave_out_stems=(), leave_out=images)
+    not_lights, leave_out = capture_files.NOT_PHOTOGRAPHS | set(REFERENCES), () if mask is None else (mask,)
+    images, listed = capture_files.find_images(folder, leave_out_stems=not_lights, leave_out=leave_out)
+    if not listed and 2 * sum(map(capture_files.is_mask_name, images)) < len(images):  # such as chrome.mask.tga
+        images = tuple(image for image in images if not capture_files.is_mask_name(image))
+    others = capture_files.list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
-    return BallFiles(folder, images, reference, mask or find_named(folder, MASK) or choose_mask(folder, images)[0])
+    mask = mask or capture_files.find_named(folder, capture_files.MASK)
+    return BallFiles(folder, images, reference, mask or capture_files.choose_mask(folder, images)[0])
 
 
 def calibrate_ball(
@@ -270,16 +244,13 @@ def calibrate_ball(
         InputError: an image cannot be read, has another size or shows no highlight; or the outline is not found or
             not entirely inside the image.
     """
-    circle_from = "--circle"
-    if circle is None:
-        circle, circle_from = _find_outline(files)
+    circle, circle_from = _find_outline(files) if circle is None else (circle, "--circle")
     view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
     highlights, normals, directions = [], [], []
     shape = files.facts[0].size[0][:2]
-    expected = ExpectedSize(shape, files.images[0].name)
     for path in files.images:
-        stored = decode_image(path, expected)
+        stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
             raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
@@ -287,16 +258,17 @@ def calibrate_ball(
             highlight = find_highlight(to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale)
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
-            check_in_front(direction[0], unit_rays(point, view.matrix)[0])
+            if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
+                problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
+                raise InputError(problem, hint="Place all lights on the camera's side of the object")
         except InputError as error:
             raise InputError(error.problem, path=path, hint=error.hint) from None
         highlights.append(highlight)
         normals.append(normal[0])
         directions.append(direction[0])
         progress()
-    return BallCalibration(
-        files, circle, circle_from, tuple(highlights), np.array(directions), np.array(normals), view, shape
-    )
+    found = (tuple(highlights), np.array(directions), np.array(normals))
+    return BallCalibration(files, circle, circle_from, *found, view, shape)
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
@@ -320,23 +292,16 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
             mask = read_mask(files.mask, expected)
             circle, source, shape = circle_from_mask(mask), "mask", mask.shape
         else:
-            gray = _mean_gray(files.images if files.reference is None else [files.reference])
+            first, *others = files.images if files.reference is None else [files.reference]
+            gray: Float32Array = read_image(first).mean(axis=2)
+            for image in others:
+                gray = gray + read_image(image, ExpectedSize(gray.shape, first.name)).mean(axis=2)
+            gray = gray / np.float32(1 + len(others))
             circle, source, shape = find_circle(gray), "picture", gray.shape
     except InputError as error:
         raise InputError(error.problem, path=error.path or path, hint=error.hint) from None
     if circle.reaches_beyond(shape):
-        raise InputError(
-            f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels) is not entirely"
-            " inside the image",
-            path=path,
-            hint="Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R",
-        )
+        ball = f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
+        hint = "Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R"
+        raise InputError(f"{ball} is not entirely inside the image", path=path, hint=hint)
     return circle, source
-
-
-def _mean_gray(images: Sequence[Path]) -> Float32Array:
-    total: Float32Array = read_image(images[0]).mean(axis=2)
-    expected = ExpectedSize(total.shape, images[0].name)
-    for path in images[1:]:
-        total = total + read_image(path, expected).mean(axis=2)
-    return total / np.float32(len(images))

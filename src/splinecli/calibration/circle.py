@@ -13,10 +13,9 @@ from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
 
-RAYS = 720
-_ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
+_ANGLES = np.arange(720) * (2 * np.pi / 720)
 _RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
-MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
+_MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
 _TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it
 
@@ -53,9 +52,8 @@ class Circle:
     def reaches_beyond(self, shape: tuple[int, ...]) -> bool:
         """Return whether a hundredth of the radius or more is outside the image."""
         reach = 0.99 * self.radius
-        height, width = shape[:2]
-        across = self.x - reach < -0.5 or self.x + reach > width - 0.5
-        return across or self.y - reach < -0.5 or self.y + reach > height - 0.5
+        places = ((self.x, shape[1]), (self.y, shape[0]))
+        return any(middle - reach < -0.5 or middle + reach > size - 0.5 for middle, size in places)
 
 
 def circle_from_mask(mask: Bools) -> Circle:
@@ -75,7 +73,7 @@ def circle_from_mask(mask: Bools) -> Circle:
     # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
     outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
-    if circle.visible < MIN_VISIBLE:
+    if circle.visible < _MIN_VISIBLE:
         problem = f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball"
         raise InputError(problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R")
     return circle
@@ -94,6 +92,7 @@ def find_circle(image: Array) -> Circle:
     small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=interpolation)
     small = cv2.GaussianBlur(small, (0, 0), 1.5)
     best: Circle | None = None
+    highest = 0.0
     for stretch in (1.0, 4.0):
         found = cv2.HoughCircles(
             (255 * (stretch * small).clip(0, 1)).astype(np.uint8),
@@ -108,22 +107,15 @@ def find_circle(image: Array) -> Circle:
         # The best circles of the Hough transform are refined.
         for x, y, radius in found[0, :12].tolist() if found is not None else ():
             # Pixel centres are at whole numbers in both images, so their corners differ by half a pixel.
-            guess = Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
-            circle = _refine(values, guess)
-            if circle is not None and (best is None or _merit(circle) > _merit(best)):
-                best = circle
+            circle = _refine(values, Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale))
+            # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is the ball.
+            merit = 0.0 if circle is None else circle.visible * math.sqrt(circle.radius)
+            if merit > highest:
+                best, highest = circle, merit
     if best is None:
-        raise InputError(
-            "found no circle, expected a ball",
-            hint="Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its"
-            " circle with --circle X,Y,R",
-        )
+        hint = "Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its circle"
+        raise InputError("found no circle, expected a ball", hint=f"{hint} with --circle X,Y,R")
     return best
-
-
-def _merit(circle: Circle) -> float:
-    # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is the ball.
-    return circle.visible * math.sqrt(circle.radius)
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
@@ -138,16 +130,16 @@ def _refine(values: Float32Array, guess: Circle) -> Circle | None:
         edge = np.abs(smooth[:, 2:] - smooth[:, :-2])
         edge[~np.isfinite(edge)] = 0
         peak = edge[:, 1:-1].argmax(axis=1) + 1
-        before, strength, after = (edge[np.arange(RAYS), peak + step] for step in (-1, 0, 1))
+        before, strength, after = (edge[np.arange(len(_RAYS)), peak + step] for step in (-1, 0, 1))
         # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
         clear = strength > 0.01  # weakest edge that is used
-        if clear.sum() < 0.2 * RAYS:
+        if clear.sum() < 0.2 * len(_RAYS):
             return None
         points = ((guess.x, guess.y) + _RAYS * reach[:, None])[clear]
-        guess = replace(_fit(points, outline_points=RAYS), points=points)
-        if guess.visible < MIN_VISIBLE:
+        guess = replace(_fit(points, outline_points=len(_RAYS)), points=points)
+        if guess.visible < _MIN_VISIBLE:
             return None
     return guess
 
@@ -161,12 +153,17 @@ def _fit(points: Float64Array, *, outline_points: int) -> Circle:
     best: tuple[float, float, float] | None = None
     most = -1
     for _ in range(300):  # random triples of points
-        circle = _through(points[generator.choice(len(points), 3, replace=False)])
-        if circle is None or not 0.2 * size < circle[2] < 3 * size:
+        (ax, ay), (bx, by), (cx, cy) = points[generator.choice(len(points), 3, replace=False)]
+        twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+        if abs(twice_area) < 1e-9:
             continue
-        agreeing = int(np.count_nonzero(_distance(points, circle) < _TOLERANCE * circle[2]))
-        if agreeing > most:
-            best, most = circle, agreeing
+        b2, c2 = (bx - ax) ** 2 + (by - ay) ** 2, (cx - ax) ** 2 + (cy - ay) ** 2
+        x, y = ((cy - ay) * b2 - (by - ay) * c2) / twice_area, ((bx - ax) * c2 - (cx - ax) * b2) / twice_area
+        circle = ax + x, ay + y, math.hypot(x, y)
+        if 0.2 * size < circle[2] < 3 * size:
+            agreeing = int(np.count_nonzero(_distance(points, circle) < _TOLERANCE * circle[2]))
+            if agreeing > most:
+                best, most = circle, agreeing
     if best is None:
         return Circle(0.0, 0.0, 1.0, math.inf, 0.0)
     for _ in range(5):
@@ -184,17 +181,6 @@ def _fit(points: Float64Array, *, outline_points: int) -> Circle:
     spread = math.sqrt(float((distance[close] ** 2).mean())) if close.any() else math.inf
     x, y, radius = (float(value) for value in best)
     return Circle(x, y, radius, spread, min(1.0, float(close.sum() / outline_points)))
-
-
-def _through(three: Float64Array) -> tuple[float, float, float] | None:
-    """Return x, y and radius of the circle through three points (3, 2), or None if they are collinear."""
-    (ax, ay), (bx, by), (cx, cy) = three
-    twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
-    if abs(twice_area) < 1e-9:
-        return None
-    b2, c2 = (bx - ax) ** 2 + (by - ay) ** 2, (cx - ax) ** 2 + (cy - ay) ** 2
-    x, y = ((cy - ay) * b2 - (by - ay) * c2) / twice_area, ((bx - ax) * c2 - (cx - ax) * b2) / twice_area
-    return ax + x, ay + y, math.hypot(x, y)
 
 
 def _distance(points: Float64Array, circle: tuple[float, float, float]) -> Float64Array:

@@ -27,11 +27,6 @@ from splinecli.surface.pixel_grid import focal_length, ray_basis
 
 Target = Literal["ball", "card"]
 
-SMALLEST_COSINE = 0.35
-"""Only pixels with n.l above this are used. Closer to grazing light, a matte ball is seldom Lambertian."""
-
-_MIN_PIXELS, _MOST_PIXELS = 50, 1 << 16
-
 
 def measure_light_intensities(
     files: BallFiles, light_directions: Float64Array, target: Target, *, radiometry: RadiometricCalibration = AS_STORED
@@ -39,17 +34,14 @@ def measure_light_intensities(
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
     By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
-    pixels are found as in a capture.
+    pixels are found as in a capture. Raises InputError if the numbers of images and lights differ, an image cannot be
+    read or has another size, or the target is dark or saturated under a light.
 
     Args:
         files: one image of the target for each light, and a mask of the target. A card without a mask fills the image.
             An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
-
-    Raises:
-        InputError: the numbers of images and lights differ, an image cannot be read or has another size, or the target
-            is dark or saturated under a light.
     """
     n_lights = len(light_directions)
     if len(files.images) != n_lights:
@@ -64,22 +56,23 @@ def measure_light_intensities(
         np.ones((n_lights, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
-    rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
+    rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.int64)
     values, found = [], []
     for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels, wanted=rows):
         found.append(image.find_saturated(None))
         values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
+    smallest = 0.35  # n.l of the pixels that are used: closer to grazing light, a matte ball is seldom Lambertian
     intensities = np.empty((n_lights, 3))
     for position, path in enumerate(files.images):
-        ratios = values[position] / np.maximum(cosines[:, position], SMALLEST_COSINE)[:, None]
+        ratios = values[position] / np.maximum(cosines[:, position], smallest)[:, None]
         if saturated is not None:
             # A card is alike everywhere: saturated pixels are its brightest, and do not shift the median. On a ball,
             # they are where n.l is largest, and the other pixels give the same intensity without them.
             ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
-        ratios = ratios[(cosines[:, position] > SMALLEST_COSINE) & ~np.isnan(ratios).any(axis=1)]
-        intensity = np.median(ratios, axis=0) if len(ratios) >= _MIN_PIXELS else np.zeros(1)
+        ratios = ratios[(cosines[:, position] > smallest) & ~np.isnan(ratios).any(axis=1)]
+        intensity = np.median(ratios, axis=0) if len(ratios) >= 50 else np.zeros(1)
         if not ((intensity > 0) & np.isfinite(intensity)).all():
             problem = "the target is dark or overexposed under this light, so the light's intensity is unknown"
             hint = "Every light needs an image of the target that is neither black nor saturated"
@@ -104,13 +97,7 @@ def target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> 
     return mask, circle.normals(x.astype(np.float64), y.astype(np.float64))
 
 
-PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
-
-HEIGHT_SPREAD = 0.5
-"""Usual difference between the heights of the balls' centres and their plane, in radii. It matters under a distant
-camera, where the size of the outlines does not determine the heights."""
-
-CONFIDENCE = 0.95  # share of positions that are within their uncertainty
+_PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +105,7 @@ class LampPositions:
     """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
 
     positions: Float64Array  # (F, 3)
-    uncertainty: Float64Array  # (F,), the distance within which the true position is with CONFIDENCE
+    uncertainty: Float64Array  # (F,), the distance within which 95 % of the true positions are
     pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
     view: View
 
@@ -133,8 +120,8 @@ class LampPositions:
 def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
     """Return the positions of the lamps from balls photographed by one camera; None for balls at one place.
 
-    The uncertainty comes from repeating the computation with other pixels (PIXEL_ERROR), heights of the balls and
-    cameras (View.draw). It is larger if the rays miss each other by more than this explains.
+    The uncertainty comes from repeating the computation with other pixels, heights of the balls and cameras
+    (View.draw). It is larger if the rays miss each other by more than this explains.
 
     Args:
         balls: at least two balls, or one at two places.
@@ -150,10 +137,10 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # If PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors did.
+    # If _PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
-    uncertainty = excess * np.quantile(errors, CONFIDENCE, axis=0, method="higher")
+    uncertainty = excess * np.quantile(errors, 0.95, axis=0, method="higher")
     return LampPositions(positions, uncertainty, pixel_size, view)
 
 
@@ -171,19 +158,20 @@ def _positions(
     def error(*shape: int) -> Float64Array:
         return np.zeros(shape) if errors is None else errors.normal(size=shape)
 
-    centres = np.array([ball_centre(ball.circle.outline + PIXEL_ERROR * error(2), matrix) for ball in balls])
+    centres = np.array([ball_centre(ball.circle.outline + _PIXEL_ERROR * error(2), matrix) for ball in balls])
     depths = -centres[:, 2]
-    shares = np.array([PIXEL_ERROR / ball.circle.radius for ball in balls])
+    shares = np.array([_PIXEL_ERROR / ball.circle.radius for ball in balls])
     plane = float(depths.mean() * (1 + (shares * error(len(balls))).mean()))
-    # The most probable depths, and their errors, given those from the outlines and HEIGHT_SPREAD.
-    weights = HEIGHT_SPREAD**2 / (HEIGHT_SPREAD**2 + (shares * depths) ** 2)
+    # The most probable depths, and their errors, given those from the outlines and the usual difference between the
+    # heights of centres, half a radius. It matters under a distant camera, where outlines do not give the heights.
+    weights = 0.5**2 / (0.5**2 + (shares * depths) ** 2)
     likely = plane + weights * (depths - depths.mean()) + np.sqrt(weights) * shares * depths * error(len(balls))
     centres *= (likely / depths)[:, None]
     height, width = balls[0].shape
     origin = np.array(((width - 1) / 2, (height - 1) / 2, 1.0)) @ ray_basis(matrix) * plane
     starts, towards = [], []
     for centre, ball in zip(centres, balls, strict=True):
-        normals, directions = reflect(centre, ball.points + PIXEL_ERROR * error(*ball.points.shape), matrix)
+        normals, directions = reflect(centre, ball.points + _PIXEL_ERROR * error(*ball.points.shape), matrix)
         starts.append(centre - origin + normals)
         towards.append(directions)
     points, miss = intersect_rays(np.array(starts), np.array(towards))
@@ -277,8 +265,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" spread {circle['spread']:.1f} pixels)"
         )
     if angles := report["disagreement_deg"]:
-        text = f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
-        lines.append(text)
+        lines.append(
+            f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
+        )
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
         lines.append("the lamps' distances are unknown: they count as distant")
@@ -316,8 +305,7 @@ def _warnings(
             " makes the rays from the balls too parallel. If the lamps are near, add --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
-    largest = lights.disagreement_deg[worst]
-    # Exact balls differ from their mean by less.
+    largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
     if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
             f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."

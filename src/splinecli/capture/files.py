@@ -28,9 +28,7 @@ _JPEG = (".jpg", ".jpeg")
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # treated as images only in a folder without others
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
-IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG, *_RARE)  # suffixes of images of an object
-
-_DIGITS = re.compile(r"([0-9]+)")
+IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)  # suffixes of images of an object
 
 
 class NoImagesError(InputError):
@@ -40,7 +38,7 @@ class NoImagesError(InputError):
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
-    parts = enumerate(_DIGITS.split(path.name.casefold()))
+    parts = enumerate(re.split(r"([0-9]+)", path.name.casefold()))
     return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
@@ -77,14 +75,12 @@ def list_images(
         and resolve(entry) not in others
     ]
     images = [image for image in images if image.suffix.lower() not in _RARE] or images
+    rank = {suffix: rank for rank, suffixes in enumerate(_KINDS) for suffix in suffixes}
     best: dict[str, int] = {}
     for image in images:
-        best[image.stem.lower()] = min(_rank(image), best.get(image.stem.lower(), len(_KINDS)))
-    return tuple(image for image in images if _rank(image) == best[image.stem.lower()])
-
-
-def _rank(image: Path) -> int:
-    return next(rank for rank, suffixes in enumerate(_KINDS) if image.suffix.lower() in suffixes)
+        stem, own = image.stem.lower(), rank[image.suffix.lower()]
+        best[stem] = min(own, best.get(stem, own))
+    return tuple(image for image in images if rank[image.suffix.lower()] == best[image.stem.lower()])
 
 
 def copies(images: Sequence[Path]) -> list[CaptureWarning]:
@@ -101,7 +97,7 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         return []
     kinds, used = (", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images))
     text = f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the same photographs, and"
-    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} are left out.")]
+    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
@@ -109,11 +105,9 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     if not images:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
         found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
-        raise NoImagesError(
-            "the folder contains no images" + (f", but {found}" if found else ""),
-            path=folder,
-            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images",
-        )
+        problem = "the folder contains no images" + (f", but {found}" if found else "")
+        hint = "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images"
+        raise NoImagesError(problem, path=folder, hint=hint)
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
@@ -162,7 +156,6 @@ def find_images(
 
 FILENAMES = "filenames.txt"
 LIGHT_POSITIONS = ("light_positions.txt",)
-LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
@@ -171,9 +164,8 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
+# Names of subfolders with the images of a capture, whose other files are in the parent; the first is PSBox's.
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
-"""Names of subfolders with the images of a capture, whose other files are in the parent; the first is PSBox's."""
-
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
     for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
@@ -222,9 +214,6 @@ class Overrides:
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
         return files
-
-
-NO_OVERRIDES = Overrides()
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
@@ -278,33 +267,25 @@ def folder_name(folder: Path) -> str:
     return (resolve(path) if ".." in path.parts else path).name or "capture"
 
 
-LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its content
-
-
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
     """Return JSON values that change when a file of the capture does. Compute them before reading the files.
 
     Images and flat fields are stamped by path, size and modification time, because reading them is slow. All other
-    files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
-
-    Raises:
-        InputError: a file cannot be read.
+    files (lights, intensities, mask, ground truth, ambient image) are stamped by their content. Raises InputError if a
+    file cannot be read.
     """
     small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
-    return (
-        [*(stamp_content(path) for path in (*files.boundaries, *small) if path is not None), *lamps],
-        [_path_size_and_time(path) for path in files.images],
-        [_path_size_and_time(path) for path in flat_field],
-    )
+    contents = [stamp_content(path) for path in (*files.boundaries, *small) if path is not None]
+    return [*contents, *lamps], [*map(_path_size_and_time, files.images)], [*map(_path_size_and_time, flat_field)]
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or the path, size and modification time of a very large one. Raises InputError."""
+    """Return the SHA-256 of a file, or the path, size and modification time of one over 64 MiB. Raises InputError."""
     check_file(path, "a file", pipe=True)
     if is_substitution(path):
         return hashlib.sha256(read_text(path)).hexdigest()
     with reading(path):
-        return file_sha256(path) if path.stat().st_size <= LARGEST_HASHED else _path_size_and_time(path)
+        return file_sha256(path) if path.stat().st_size <= 1 << 26 else _path_size_and_time(path)
 
 
 def digest(stamp: Sequence[Any]) -> str:

@@ -7,49 +7,23 @@ for each line of the object's light.txt: 00000.tif and so on. A capture is one s
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from splinecli.capture.files import (
-    FILENAMES,
-    GROUND_TRUTH,
-    IMAGE_FOLDERS,
-    LIGHT_INTENSITIES,
-    MASK,
-    NO_OVERRIDES,
-    NOT_PHOTOGRAPHS,
-    CaptureFiles,
-    NoImagesError,
-    Overrides,
-    check_not_empty,
-    choose_mask,
-    copies,
-    find_images,
-    find_named,
-    folder_name,
-    is_mask_name,
-    list_folder,
-    list_images,
-)
+from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
 from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
 from splinecli.system.files import StrPath, is_folder, resolve
 
-TREES = ("PRPS", "PRPS_Diffuse")  # folders of objects in the published tree
-
 _PREFIX = "images_"
 _LIGHTS = "light.txt"
 _BOUNDARIES = ("inboundary.png", "onboundary.png")
-_MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
-# Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
-_ENOUGH_MARKS = 2
-_USUAL_LIGHTS = [name for each in FORMATS if not each.rank for name in each.found]
-_NUMBERED = re.compile(r"\d{5}\.tif")
 
 
-def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
     Raises InputError if a file is missing, there are several such folders, or the images do not match the lights.
@@ -66,52 +40,52 @@ def find_cyclesps(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         problem = f"found {len(captures)} folders of images ({names}), expected one"
         raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
     holder = _parent(images_folder)
-    lights = overrides.lights or find_named(holder, [_LIGHTS])
+    lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
-        problem = f"found no {_LIGHTS}, expected the light directions of {images_folder.name}"
+        problem = f"found no light.txt, expected the light directions of {images_folder.name}"
         raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
-    return CaptureFiles(
+    images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
+    # The object is the union of both masks, so one alone would be wrong.
+    masks = {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
+    if missing := [name for name, path in masks.items() if path is None]:
+        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(problem, path=holder, hint="Pass --mask FILE")
+    return files.CaptureFiles(
         "CyclesPS",
         _name(images_folder),
         holder,
-        _list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        images,
         lights,
         light_intensities=overrides.intensities,
         mask=overrides.mask,
-        boundaries=() if overrides.mask else _find_boundaries(holder),
-        ground_truth=overrides.ground_truth or find_named(holder, GROUND_TRUTH),
+        boundaries=tuple(path for path in masks.values() if path is not None),
+        ground_truth=overrides.ground_truth or files.find_named(holder, files.GROUND_TRUTH),
     )
-
-
-def cyclesps_name(folder: Path) -> str | None:
-    """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
-    try:
-        captures = list_cyclesps(folder) if is_folder(folder) else None
-    except InputError:  # reading the capture will raise it again
-        return None
-    return _name(captures[0]) if captures and len(captures) == 1 else None
 
 
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
-    is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
-    if not (is_images_folder or _has_marks(folder)) or find_named(folder, _USUAL_LIGHTS) is not None:
+    is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
+    usual_lights = [name for each in FORMATS if not each.rank for name in each.found]
+    if not (is_images_folder or _has_marks(folder)) or files.find_named(folder, usual_lights) is not None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
-    captures = [entry for entry in list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    captures = [entry for entry in files.list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
     # Images beside light.txt are a plain folder, to be used with --lights light.txt.
-    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return None if not captures and list_images(folder, leave_out_stems=no_photographs) else captures
+    no_photographs = files.NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
+    return None if not captures and files.list_images(folder, leave_out_stems=no_photographs) else captures
 
 
 def _name(images_folder: Path) -> str:
-    return f"{folder_name(_parent(images_folder))}_{folder_name(images_folder).removeprefix(_PREFIX)}"
+    return f"{files.folder_name(_parent(images_folder))}_{files.folder_name(images_folder).removeprefix(_PREFIX)}"
 
 
 def _has_marks(folder: Path) -> bool:
-    marked = [entry for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
-    return len({entry.name.lower() for entry in marked}) >= _ENOUGH_MARKS
+    """Return whether there are two of four files: some may be missing, and no other folder is mistaken for one."""
+    marks = {"light.txt", "gt_normal.tif", *_BOUNDARIES}
+    names = {entry.name.lower() for entry in files.list_folder(folder) if not is_folder(entry)}
+    return len(marks & names) >= 2
 
 
 def _parent(folder: Path) -> Path:
@@ -119,60 +93,42 @@ def _parent(folder: Path) -> Path:
     return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
 
 
-def _find_boundaries(holder: Path) -> tuple[Path, ...]:
-    """Return both masks. The object is their union, so one alone would be wrong."""
-    found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
-    missing = [name for name, path in found.items() if path is None]
-    if missing:
-        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
-        raise InputError(problem, path=holder, hint="Pass --mask FILE")
-    return tuple(path for path in found.values() if path is not None)
-
-
 def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
     """Return the images 00000.tif and so on, one for each light."""
-    there = {entry.name.lower(): entry for entry in list_folder(folder)}
+    there = {entry.name.lower(): entry for entry in files.list_folder(folder)}
     wanted = [f"{index:05}.tif" for index in range(n_lights)]
     expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
     for name in wanted:
         if name not in there:
             raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
-    n_images = sum(bool(_NUMBERED.fullmatch(name)) for name in there)
+    n_images = sum(bool(re.fullmatch(r"\d{5}\.tif", name)) for name in there)
     if n_images != n_lights:
         raise InputError(f"found {n_images} images, expected {expected}", path=folder)
     return tuple(there[name] for name in wanted)
 
 
-_WORD = re.compile(r"[a-z]+")
+_PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+# Words in the names of pictures that other programs leave beside the photographs.
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
-"""Words in the names of pictures that other programs leave beside the photographs."""
-
-_RESULT_WORDS = frozenset({"demo", "result", "results"})
-"""The same, if no light file gives the number of photographs."""
-
-_MOST_OTHERS = 0.25  # share of the images; if more names have these words, they are photographs
-
-
-PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
 
 
 def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
-    return not words.isdisjoint(_WORD.findall(image.stem.lower()))
+    return not words.isdisjoint(re.findall(r"[a-z]+", image.stem.lower()))
 
 
-def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
+def find_capture_files(folder: StrPath, overrides: files.Overrides | None = None) -> files.CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
     Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
     does not exist; the light file is missing; or a file of the overrides does not exist.
     """
-    folder = Path(folder)
-    list_folder(folder)  # raises if it is not a folder
+    folder, overrides = Path(folder), overrides or files.Overrides()
+    files.list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
         # The plain folder comes last, because it accepts any folder with images.
         return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
-    except NoImagesError as error:
+    except files.NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
             raise
@@ -183,21 +139,26 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 def capture_name(folder: StrPath) -> str:
     """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises InputError."""
     folder = Path(folder)
-    return folder.stem if is_film(folder) else cyclesps_name(folder) or _own_name(folder)
+    if is_film(folder):
+        return folder.stem
+    captures = None
+    with suppress(InputError):  # reading the capture will raise it again
+        captures = list_cyclesps(folder) if is_folder(folder) else None
+    return _name(captures[0]) if captures and len(captures) == 1 else _own_name(folder)
 
 
 def _own_name(folder: Path) -> str:
     """Return the name of a folder, or its parent's name if the folder is called `images`. Raises InputError."""
-    name = folder_name(folder)
-    return folder_name(_parent(folder)) if name in IMAGE_FOLDERS and _parent(folder) != folder else name
+    name = files.folder_name(folder)
+    return files.folder_name(_parent(folder)) if name in files.IMAGE_FOLDERS and _parent(folder) != folder else name
 
 
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
-    inside = next((path for name in IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None or not all(map(_is_other, list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS))):
+    inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
+    if inside is None or not all(map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))):
         return None
-    return inside if list_images(inside, leave_out_stems=NOT_PHOTOGRAPHS) else None
+    return inside if files.list_images(inside, leave_out_stems=files.NOT_PHOTOGRAPHS) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -206,10 +167,8 @@ def find_captures(folder: StrPath) -> list[Path]:
     A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
     or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
     captures are found by names of files; reading one may still fail. A subfolder that cannot be listed is treated as a
-    capture, so that the caller reports the error on reading it.
-
-    Raises:
-        InputError: the folder is missing, is a file, or contains no capture.
+    capture, so that the caller reports the error on reading it. Raises InputError if the folder is missing, is a file,
+    or contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
@@ -223,17 +182,17 @@ def find_captures(folder: StrPath) -> list[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    return [entry for entry in list_folder(folder) if is_folder(entry)]
+    return [entry for entry in files.list_folder(folder) if is_folder(entry)]
 
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
-        objects = folder / IMAGE_FOLDERS[0]
-        is_psbox = is_folder(objects) and find_named(folder, PSBOX_LIGHTS) is not None
+        objects = folder / files.IMAGE_FOLDERS[0]
+        is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
-            find_named(folder, [FILENAMES]) is not None
-            or list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS)
+            files.find_named(folder, [files.FILENAMES]) is not None
+            or files.list_images(objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS)
             or _images_folder(folder) is not None
         ):
             return [folder]
@@ -243,53 +202,52 @@ def _captures_in(folder: Path) -> list[Path]:
 def _captures_below(folder: Path) -> list[Path]:
     """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
     try:
-        if folder.name in TREES:
+        if folder.name in ("PRPS", "PRPS_Diffuse"):
             return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
         return _captures_in(folder)
     except InputError:
         return [folder]
 
 
-def _find_plain(folder: Path, overrides: Overrides) -> CaptureFiles:
+def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     """Return the capture's files. Raises InputError if images or lights are missing, or filenames.txt is wrong.
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
-    listed = find_named(folder, [FILENAMES]) is not None
+    listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
-    images, _ = find_images(of_images, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | _RESULT_WORDS
+    images, _ = files.find_images(of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    # Without a light file, nothing gives the number of photographs.
+    words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
-    if listed or len(others) > _MOST_OTHERS * len(images):
+    if listed or len(others) > 0.25 * len(images):  # so many are photographs
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
-        raise InputError(
-            f"the folder contains {len(images)} images but no light file ({light_names()})",
-            path=folder,
-            hint=f"Add {option}"
-            if option
-            else "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
-            " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
+        hint = (
+            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from images"
+            " of a mirror ball. Without one, --lights estimate finds them from the images, with lower accuracy"
         )
-    layout, ground_truth = "plain folder", GROUND_TRUTH
-    if listed and find_named(folder, ["light_directions.txt"]) is not None:
+        problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
+        raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)
+    layout, ground_truth = "plain folder", files.GROUND_TRUTH
+    if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
-        layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    files = _gather(layout, folder, images, lights, overrides, ground_truth, others)
-    return files if listed else replace(files, warnings=(*files.warnings, *copies(images)))
+        layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
+    found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
+    return found if listed else replace(found, warnings=(*found.warnings, *files.copies(images)))
 
 
-def _find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
-    lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
-    objects = folder / IMAGE_FOLDERS[0]
+    lights = overrides.lights or files.find_named(folder, _PSBOX_LIGHTS)
+    objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
-    images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    check_not_empty(images, objects)
+    images = files.list_images(objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    files.check_not_empty(images, objects)
     return _gather("PSBox", folder, images, lights, overrides)
 
 
@@ -298,27 +256,27 @@ def _gather(
     folder: Path,
     images: tuple[Path, ...],
     lights: Path | None,
-    overrides: Overrides,
-    ground_truth: Sequence[str] = GROUND_TRUTH,
+    overrides: files.Overrides,
+    ground_truth: Sequence[str] = files.GROUND_TRUTH,
     others: tuple[Path, ...] = (),
-) -> CaptureFiles:
+) -> files.CaptureFiles:
     """Return the capture's files: the images, the lights, and any optional files in the folder.
 
     Files named by the user take precedence over files in the folder.
     """
-    mask, warnings = overrides.mask or find_named(folder, MASK), tuple[CaptureWarning, ...]()
+    mask, warnings = overrides.mask or files.find_named(folder, files.MASK), tuple[CaptureWarning, ...]()
     if mask is None:
-        mask, warnings = choose_mask(folder, images)
-        others = tuple(path for path in others if not warnings or not is_mask_name(path))
-    return CaptureFiles(
+        mask, warnings = files.choose_mask(folder, images)
+        others = tuple(path for path in others if not warnings or not files.is_mask_name(path))
+    return files.CaptureFiles(
         layout,
         _own_name(folder),
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        light_intensities=overrides.intensities or files.find_named(folder, ["light_intensities.txt"]),
         mask=mask,
-        ground_truth=overrides.ground_truth or find_named(folder, ground_truth),
+        ground_truth=overrides.ground_truth or files.find_named(folder, ground_truth),
         others=others,
         warnings=warnings,
     )

@@ -16,27 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import light_formats
+from splinecli.capture import light_formats as readers
+from splinecli.capture import light_rows
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
-from splinecli.capture.formats.numbers import (
-    DECIMAL_POINT,
-    MOST_TEXT,
-    NumberRows,
-    columns,
-    has_decimal_commas,
-    read_number_rows,
-)
-from splinecli.capture.light_rows import (
-    COLUMNS,
-    USUAL_FRAME,
-    LightFrame,
-    RowForm,
-    check_angles,
-    counts_rows,
-    directions_from_angles,
-    read_light_rows,
-    refuse_angles,
-)
+from splinecli.capture.formats import numbers
+from splinecli.capture.formats.numbers import NumberRows
+from splinecli.capture.light_rows import USUAL_FRAME, LightFrame, RowForm
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 from splinecli.maths.normals import unit
@@ -46,8 +31,8 @@ _FILE = "a text file with a line {} for each image"
 
 
 def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    meaning = COLUMNS[form]
-    return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+    meaning = light_rows.COLUMNS[form]
+    return light_rows.read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
 
 
 def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
@@ -75,25 +60,19 @@ class LightFormat:
     found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
     rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
     recognise: Callable[[Path], bool] = Path.exists  # decides by content between formats with one suffix
-    encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = (
-        None  # directions (F, 3) of images; None if only read
-    )
+    encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = None  # from directions (F, 3); None if only read
 
 
 FORMATS = (
     LightFormat("text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text),
-    LightFormat(
-        "NumPy", (".npy",), light_formats.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy
-    ),
-    LightFormat("RTI", (".lp",), light_formats.read_lp, ("*.lp",), 1, encode=_encode_lp),
-    LightFormat("Relight", (".dome", ".json"), light_formats.read_dome, ("*.dome",), 2, light_formats.is_dome),
-    LightFormat(
-        "JSON list", (".json",), light_formats.read_json_list, ("light_directions.json",), 2, light_formats.is_list
-    ),
-    LightFormat("AliceVision", (".json",), light_formats.read_alicevision, ("*lights.json",), 1),
+    LightFormat("NumPy", (".npy",), readers.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy),
+    LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
+    LightFormat("Relight", (".dome", ".json"), readers.read_dome, ("*.dome",), 2, readers.is_dome),
+    LightFormat("JSON list", (".json",), readers.read_json_list, ("light_directions.json",), 2, readers.is_list),
+    LightFormat("AliceVision", (".json",), readers.read_alicevision, ("*lights.json",), 1),
     LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
-    LightFormat("MATLAB", (".mat",), light_formats.read_matrix, ("light_directions.mat", "lights.mat"), 2),
-    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), light_formats.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
+    LightFormat("MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2),
+    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), readers.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )
 """All formats of light files. This table defines how they are named, found, read and written."""
 
@@ -129,10 +108,6 @@ def find_lights(folder: Path) -> Path | None:
     return find_named(folder, LIGHT_POSITIONS)
 
 
-_SLANT_WORD, _NO_LIGHTS = re.compile("slant|tilt"), re.compile("intens|camera|filenames|lobes")
-_MOST_TRIED = 50  # files of a folder
-
-
 def light_option(folders: Sequence[Path], n_images: int) -> str | None:
     """Return the options that read a file in one of the folders as lights; None for no such file."""
     suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
@@ -140,19 +115,16 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
         with suppress(InputError, OSError):
             entries = [e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)]
             entries.sort(key=lambda e: "light" not in e.name.lower())
-            for path in entries[:_MOST_TRIED]:
+            for path in entries[:50]:
                 name = path.name.lower()
-                if _NO_LIGHTS.search(name) or path.stat().st_size > MOST_TEXT:
+                if re.search("intens|camera|filenames|lobes", name) or path.stat().st_size > numbers.MOST_TEXT:
                     continue
-                angles: RowForm = "slant-tilt" if _SLANT_WORD.search(name) else "azel"
+                angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
                 for form in ("xyz", angles):
                     with suppress(InputError):
                         read_lights(path, n_images, form=form)
                         return f"--lights {path}" + (f" --light-format {form}" if form != "xyz" else "")
     return None
-
-
-_STRONGEST = 1e12  # largest intensity; it and its inverse are within float32's range
 
 
 def read_light_directions(
@@ -174,12 +146,8 @@ def read_light_directions(
             light below the horizon; also if the count disagrees with the count line or with n_images, and for angles
             that are read as vectors.
     """
-    return lights_of(read_light_table(Path(path), n_images, form), n_images, frame, form)[1]
-
-
-def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Return the rows of a light file of any format. Raises InputError; see read_light_directions."""
-    return format_of(path).read(path, n_images, form)
+    path = Path(path)
+    return lights_of(format_of(path).read(path, n_images, form), n_images, frame, form)[1]
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Float64Array:
@@ -188,7 +156,8 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
     Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
     rows that name their images.
     """
-    table = read_light_table(Path(path), n_images, "positions")
+    path = Path(path)
+    table = format_of(path).read(path, n_images, "positions")
     positions, _ = lights_of(table, n_images, frame, "positions")
     if table.names is not None:
         problem = f"found the name {table.names[0]!r}, expected x y z"
@@ -204,14 +173,14 @@ def lights_of(
     if table.are_vectors:
         form = "positions" if form == "positions" else "xyz"
     else:
-        table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+        table = _sort_by_count(_drop_count_line(table, n_images), min(light_rows.COLUMNS[form]), n_images)
         if form == "xyz":
-            refuse_angles(table)
+            light_rows.refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
-    vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
+    vectors, transposed = _one_light_a_row(table, light_rows.COLUMNS[form], what, n_images)
     if form in ("azel", "slant-tilt"):
-        check_angles(table, form)
-        vectors = directions_from_angles(vectors, form)
+        light_rows.check_angles(table, form)
+        vectors = light_rows.directions_from_angles(vectors, form)
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     places = [
@@ -220,9 +189,6 @@ def lights_of(
     ]
     lamps = form == "positions"
     return vectors, unit_directions(vectors, table.path, lines, places, lamps=lamps, leave_bad=leave_bad)
-
-
-_MOST_BAD = 0.1  # share of the lights that may be wrong in a file in the right frame
 
 
 def unit_directions(
@@ -236,20 +202,19 @@ def unit_directions(
 ) -> Float64Array:
     """Return vectors (F, 3) at unit length.
 
+    Raises InputError for a zero vector, or a light that is not above the horizon.
+
     Args:
         vectors: of any length.
         places: words for the place of each vector on its line.
         lamps: whether the vectors are positions of lamps, for messages.
         leave_bad: return a few lights that are zero or below the horizon as they are (z <= 0), for the caller to drop.
-
-    Raises:
-        InputError: a zero vector, or a light that is not above the horizon.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # First divide by the largest component, because squares of very large or small ones exceed float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
-    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= _MOST_BAD * len(directions):
+    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(directions):  # the frame is right
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
@@ -257,15 +222,12 @@ def unit_directions(
             hint = "Write x y z towards the light, or remove the line and its image"
             raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
-            raise InputError(
-                f"found a {'lamp behind the object' if lamps else 'light below the horizon'}{place}"
-                f" (z = {vector[2]:g}), expected z > 0",
-                path=path,
-                line=line,
-                hint="z points away from the camera in this file: add --light-frame z-away"
-                if (directions[:, 2] < 0).all()
-                else "z points to the camera; the file may be in another frame",
-            )
+            what = "lamp behind the object" if lamps else "light below the horizon"
+            hint = "z points to the camera; the file may be in another frame"
+            if (directions[:, 2] < 0).all():
+                hint = "z points away from the camera in this file: add --light-frame z-away"
+            problem = f"found a {what}{place} (z = {vector[2]:g}), expected z > 0"
+            raise InputError(problem, path=path, line=line, hint=hint)
     return directions
 
 
@@ -275,18 +237,16 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
     with the line for an unusable intensity.
     """
-    table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
+    table = _drop_count_line(numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
-    for light, channel in np.argwhere((intensities < 1 / _STRONGEST) | (intensities > _STRONGEST)):
-        value = intensities[light, channel]
+    # Such numbers and their inverses are within float32's range.
+    for light, channel in np.argwhere((intensities < 1e-12) | (intensities > 1e12)):
+        value, line = intensities[light, channel], table.rows[channel if transposed else light].line
         place = f" in column {light + 1}" if transposed else ""
-        raise InputError(
-            f"found the intensity {value:g}{place}, expected a number"
-            f" {'above 0' if value <= 0 else f'from {1 / _STRONGEST:g} to {_STRONGEST:g}'}",
-            path=table.path,
-            line=table.rows[channel if transposed else light].line,
-        )
+        expected = "above 0" if value <= 0 else "from 1e-12 to 1e+12"
+        problem = f"found the intensity {value:g}{place}, expected a number {expected}"
+        raise InputError(problem, path=table.path, line=line)
     return np.broadcast_to(intensities, (n_images, 3)).copy()
 
 
@@ -295,7 +255,7 @@ def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> N
     rows = table.rows
     fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
     in_columns = n_images is None and len(rows) == n_columns  # one light in each
-    if not fits or in_columns or counts_rows([row.numbers[0] for row in rows]) is None:
+    if not fits or in_columns or light_rows.counts_rows([row.numbers[0] for row in rows]) is None:
         return table
     ordered = sorted(rows, key=lambda row: row.numbers[0])
     return replace(table, rows=tuple(row._replace(numbers=row.numbers[1:]) for row in ordered))
@@ -313,7 +273,7 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if count in (len(following), len(following[0].numbers)):
         return without
     if not count.is_integer():
-        expected = columns(len(following[0].numbers))
+        expected = numbers.columns(len(following[0].numbers))
         raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
     problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
     raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
@@ -332,9 +292,11 @@ def _one_light_a_row(
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.rows[0].text
-        decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
-        problem = f"found {columns(n_columns)}, expected {expected}"
-        hint = DECIMAL_POINT if decimal_commas else None
+        decimal_commas = n_columns > 3 and (
+            numbers.has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
+        )
+        problem = f"found {numbers.columns(n_columns)}, expected {expected}"
+        hint = numbers.DECIMAL_POINT if decimal_commas else None
         raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
@@ -381,13 +343,10 @@ class NamedLights:
             return tuple(images), "order"
         present = {image.name.casefold() for image in images}
         missing = next((i for i, name in enumerate(self.names) if name.casefold() not in present), 0)
-        raise InputError(
-            f"found {len(self.names)} lights but {len(images)} images;"
-            f' the image "{self.names[missing]}" is not among them',
-            path=self.path,
-            line=self.lines[missing],
-            hint="Correct the names in the file, or give as many images as lights, in the same order",
-        )
+        problem = f"found {len(self.names)} lights but {len(images)} images; the image"
+        hint = "Correct the names in the file, or give as many images as lights, in the same order"
+        problem = f'{problem} "{self.names[missing]}" is not among them'
+        raise InputError(problem, path=self.path, line=self.lines[missing], hint=hint)
 
 
 def read_lights(
@@ -398,7 +357,7 @@ def read_lights(
     The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises InputError; see
     read_light_directions. A few lights below the horizon are left as they are.
     """
-    table = read_light_table(path, n_images, form)
+    table = format_of(path).read(path, n_images, form)
     n_rows = n_images if table.names is None else None
     _, directions = lights_of(table, n_rows, frame, form, leave_bad=form != "positions")
     if table.names is None:
@@ -406,21 +365,17 @@ def read_lights(
     return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions, table.intensities)
 
 
-def check_writable(path: Path) -> None:
-    """Raise UsageError for a light file whose format is only read."""
+def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
+    """Return the encoder of the format that a file's suffix names. Raises UsageError for one that is only read."""
     suffix = path.suffix.lower()
-    if _written_as(suffix) is None:
+    encode = next((each for each in FORMATS if suffix in each.suffixes), FORMATS[0]).encode
+    if encode is None:
         *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))
         hint = f"Write {', '.join(most)} or {last}"
         raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=hint)
+    return encode
 
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
     """Return a light file of directions (F, 3) of images, in the format that its suffix names; see check_writable."""
-    encode = _written_as(path.suffix.lower())
-    assert encode is not None
-    return encode(directions, images)
-
-
-def _written_as(suffix: str) -> Callable[[Float64Array, Sequence[Path]], bytes] | None:
-    return next((each for each in FORMATS if suffix in each.suffixes), FORMATS[0]).encode
+    return check_writable(path)(directions, images)

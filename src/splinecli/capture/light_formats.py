@@ -17,25 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.numbers import (
-    MOST_TEXT,
-    NumberRows,
-    Row,
-    check_length,
-    parse_number,
-    read_lines,
-    read_matrices,
-    read_text,
-    split_words,
-    to_number,
-    uses_decimal_commas,
-)
+from splinecli.capture.formats import numbers
+from splinecli.capture.formats.numbers import NumberRows, Row, to_number
 from splinecli.capture.light_rows import RowForm, image_name
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
 from splinecli.system.files import parse_json
-
-_MOST_DIGITS = 9  # of the number of lights
 
 
 def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
@@ -43,7 +30,7 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 
     The number may be missing, as other programs leave it out.
     """
-    stored = read_lines(path, else_latin_1=True)
+    stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
         raise InputError("the file is empty, expected the number of lights on the first line", path=path)
@@ -53,20 +40,20 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
         rows = content
     elif not count.isdecimal():
         raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
-    elif int(count[:_MOST_DIGITS]) != len(rows):
+    elif int(count[:9]) != len(rows):
         problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
         raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
     if not rows:
         raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
-    commas = uses_decimal_commas([text for _, text in rows], 3)
+    commas = numbers.uses_decimal_commas([text for _, text in rows], 3)
     for line, text in rows:
         words = text.rsplit(maxsplit=3)
         if len(words) < 4:
             raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
         names.append(image_name(words[0], []))
-        numbers = split_words(" ".join(words[1:]), decimal_commas=commas)
-        vectors.append(Row(tuple(parse_number(word, path, line) for word in numbers[:3]), line, text))
+        words = numbers.split_words(" ".join(words[1:]), decimal_commas=commas)[:3]
+        vectors.append(Row(tuple(numbers.parse_number(word, path, line) for word in words), line, text))
     return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
 
 
@@ -122,12 +109,11 @@ def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     key = next((key for key in keys if document.get(key)), None)
     if key is None:
         raise InputError(f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path)
-    vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb")
+    vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" has not x, y and z for each light', path=path)
-    adjusted = factors is not None and len(factors) == len(vectors) and min(map(min, factors)) > 0
-    intensities = [[1 / factor for factor in light] for light in factors] if adjusted and factors else []
-    return _unnumbered(path, vectors, None, intensities)
+        raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
+    adjusted = len(factors) == len(vectors) and min(map(min, factors)) > 0
+    return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors if adjusted])
 
 
 def is_list(path: Path) -> bool:
@@ -146,24 +132,20 @@ def read_json_list(path: Path, n_images: int | None, form: RowForm) -> NumberRow
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    if isinstance(document, dict) and len(document) == 1 and isinstance(next(iter(document.values())), list):
-        (inner,) = document.values()
-        document = document if _vectors(inner) is None else inner
-    if isinstance(document, dict):
-        vectors = _vectors(list(document.values()))
-        return None if vectors is None else (tuple(image_name(name, []) for name in document), vectors)
-    vectors = _vectors(document)
-    return None if vectors is None else (None, vectors)
+    if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()) is not None:
+        (document,) = document.values()
+    names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
+    vectors = _vectors(document if names is None else list(document.values()))
+    return None if vectors is None else (names, vectors)
 
 
 def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
     """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None for anything else."""
-    if not isinstance(values, list) or not values:
-        return None
-    vectors: list[Any] = [[each.get(key) for key in keys] if isinstance(each, dict) else each for each in values]
+    listed = values if isinstance(values, list) else []
+    vectors: list[Any] = [[each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed]
     if not all(isinstance(vector, list) and len(vector) > 1 and all(map(_is_finite, vector)) for vector in vectors):
         return None
-    return [[float(number) for number in vector] for vector in vectors]
+    return [[float(number) for number in vector] for vector in vectors] or None
 
 
 def _is_finite(value: Any) -> bool:
@@ -182,7 +164,7 @@ def _unnumbered(
 def _read_document(path: Path) -> Any:
     """Return the value of a JSON file. Raises InputError."""
     try:
-        return parse_json("\n".join(read_lines(path)))
+        return parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
     except ValueError as error:
@@ -191,10 +173,9 @@ def _read_document(path: Path) -> Any:
 
 def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
     values = light.get(key)
-    numbers = [float(value) for value in (values if isinstance(values, list) else ()) if _is_finite(value)]
-    if len(numbers) != 3 or len(values or ()) != 3:
+    if not (isinstance(values, list) and len(values) == 3 and all(map(_is_finite, values))):
         raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
-    return numbers
+    return [float(value) for value in values]
 
 
 # OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
@@ -213,17 +194,16 @@ _XML = re.compile(
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count them from 1."""
     suffix = path.suffix.lower()
+    numbers.check_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
     else:
-        check_length(path, MOST_TEXT)
-        array = _choose(read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
+        array = _choose(numbers.read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
     if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
-        raise InputError(
-            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3", path=path
-        )
+        problem = f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3"
+        raise InputError(problem, path=path)
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
-    return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
+    return NumberRows(path, tuple(Row(tuple(row), line) for line, row in rows))
 
 
 def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
@@ -240,7 +220,6 @@ def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | No
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
-    check_length(path, MOST_TEXT)
     try:
         with path.open("rb") as file:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -252,14 +231,13 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
 
 def _read_opencv(path: Path) -> dict[str, Float64Array]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
-    text = read_text(path).decode(errors="replace")
+    text = numbers.read_text(path).decode(errors="replace")
     found: dict[str, Float64Array] = {}
     for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
         try:
-            numbers = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
-            found[name] = numbers.reshape(int(rows), int(columns))
+            values = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
+            found[name] = values.reshape(int(rows), int(columns))
         except ValueError:
-            raise InputError(
-                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}", path=path
-            ) from None
+            problem = f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}"
+            raise InputError(problem, path=path) from None
     return found

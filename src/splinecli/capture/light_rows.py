@@ -11,13 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from splinecli.capture.formats.numbers import (
-    NumberRows,
-    Row,
-    parse_rows,
-    read_rows_of_words,
-    to_number,
-)
+from splinecli.capture.formats.numbers import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 
@@ -93,7 +87,7 @@ def parse_light_frame(text: str | None) -> LightFrame:
             raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
-            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} comes twice", hint="Leave one out")
+            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} is listed twice", hint="Leave one out")
         signs[axis] = sign
     return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
 
@@ -110,8 +104,6 @@ COLUMNS: dict[RowForm, dict[int, str]] = {
     "positions": {3: "x y z"},
 }
 """The number of columns of each form, and their meaning."""
-
-_ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format azel"
 
@@ -173,17 +165,13 @@ def refuse_angles(table: NumberRows) -> None:
     found, hint = "", AZEL_HINT
     if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
         found = f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3 columns (x y z)"
-    elif lengths == {3} and not numbered and _have_one_radius(np.array(rows)):
-        found, hint = f"azimuth, elevation and {rows[0][2]:g}, expected x y z", f"Leave the third column out. {hint}"
+    elif lengths == {3} and not numbered:  # perhaps with the same radius; vectors around an object have y < 0
+        azimuth, elevation, radius = np.array(rows).T
+        in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
+        if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
+            found, hint = f"azimuth, elevation and {radius[0]:g}, expected x y z", f"Leave the third column out. {hint}"
     if found:
         raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
-
-
-def _have_one_radius(rows: Float64Array) -> bool:
-    """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
-    azimuth, elevation, radius = rows.T
-    all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
-    return bool(np.ptp(radius) == 0 and all_in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90)
 
 
 def counts_rows(column: list[float]) -> int | None:
@@ -192,7 +180,6 @@ def counts_rows(column: list[float]) -> int | None:
     return next((first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None)
 
 
-_FOLDERS = re.compile(r"[/\\]")
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
 _ANGLE = re.compile(r"(az|el|alt|slant|tilt)")
 _AXES, _ANGLES, _SLANTS = ("x", "y", "z"), ("az", "el"), ("slant", "tilt")
@@ -216,7 +203,8 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
     if len(rows) > 1 and all(to_number(word) is None for word in rows[0][2]):
         line, _, header = rows.pop(0)
         order = _order_of(header[-n_numbers:])
-        found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+        zenith = ("zen", "polar", "incl", "colat", "coelev")
+        found = next((word for word in header if word.lower().startswith(zenith)), None)
         if found is not None and n_numbers == len(_ANGLES):
             problem = f'found the column "{found[:40]}", expected azimuth and elevation'
             hint = "The elevation is 90 minus the angle from the camera axis"
@@ -259,4 +247,4 @@ def image_name(text: str, numbers: list[str]) -> str:
     """Return the image name before the last numbers of a row, without folders, quotes and separators."""
     for word in reversed(numbers):
         text = text.rstrip(" \t,;")[: -len(word)]
-    return _FOLDERS.split(text.strip(" \t,;\"'"))[-1]
+    return re.split(r"[/\\]", text.strip(" \t,;\"'"))[-1]

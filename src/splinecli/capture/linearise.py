@@ -24,8 +24,6 @@ from splinecli.restoration.lamps import COLOUR_SAMPLE, lamp_colours
 
 Numbers = TypeVar("Numbers", bound=np.generic)
 
-_SCALE, _CROP = re.compile(r"1(?:/(\d{1,3}))?"), re.compile(r"\d{1,9}(?:,\d{1,9}){3}")
-
 
 @dataclass(frozen=True)
 class Window:
@@ -41,12 +39,8 @@ class Window:
 
     def in_words(self) -> str | None:
         """Return a description of the window for messages; None for whole images."""
-        words = []
-        if self.box is not None:
-            left, top, width, height = self.box
-            words.append(f"{width} x {height} pixels from ({left}, {top})")
-        if self.step > 1:
-            words.append(f"one of {self.step} rows and columns")
+        words = [] if self.box is None else ["{2} x {3} pixels from ({0}, {1})".format(*self.box)]
+        words += [f"one of {self.step} rows and columns"] if self.step > 1 else []
         return ", ".join(words) or None
 
     def of(self, pixels: NDArray[Numbers]) -> NDArray[Numbers]:
@@ -94,22 +88,16 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
     """Return the window of --crop X,Y,W,H and --scale 1/N. Raises UsageError."""
     box: tuple[Any, ...] | None = None
     if crop is not None:
-        found = _CROP.fullmatch(crop.replace(" ", ""))
+        found = re.fullmatch(r"\d{1,9}(?:,\d{1,9}){3}", crop.replace(" ", ""))
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
             problem = f"--crop is {crop!r}; expected X,Y,W,H: the left upper corner and the size in pixels"
             raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
-    step = 1
-    if scale is not None:
-        found = _SCALE.fullmatch(scale.replace(" ", ""))
-        step = int(found[1] or 1) if found else 0
-        if not step:
-            raise UsageError(f"--scale is {scale!r}; expected 1/N, such as 1/4")
+    found = re.fullmatch(r"1(?:/(\d{1,3}))?", "1" if scale is None else scale.replace(" ", ""))
+    step = int(found[1] or 1) if found else 0
+    if not step:
+        raise UsageError(f"--scale is {scale!r}; expected 1/N, such as 1/4")
     return Window(box, step)
-
-
-BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
-_DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
 
 @dataclass(frozen=True)
@@ -126,49 +114,44 @@ class RadiometricCalibration:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
         if self.curve != 1:
             return self, []
-        curves = {image.curve.curve for image in images}
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
-        unread = [image.path.name for image in images if image.curve.unread]
-        warnings = []
-        if unread and self.automatic:
+        if not self.automatic:
+            text = f"The images say that they are display-encoded ({by}), but are read as linear, as --transfer says."
+            text += " Leave it out if their values are not linear."
+            return self, [CaptureWarning(codes.DISPLAY_ENCODED, text)] if by else []
+        unread, warnings = [image.path.name for image in images if image.curve.unread], []
+        if unread:
             text = f"The colour profile of {unread[0]} has no curve that can be read, so it does not count."
             warnings.append(CaptureWarning(codes.PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G."))
-        if self.automatic and len(curves) == 1:
-            (curve,) = curves
-            if curve not in (1, BT709):  # a film has no other curve
-                how = "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}" if curve else "sRGB"
-                text = f"The images say that they are display-encoded ({by}) and are read as {how}."
-                text += " Add --transfer linear if their values are linear."
-                warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
-            return replace(self, curve=curve), warnings
-        if by and self.automatic:
-            text = f"The images look display-encoded ({by}) but are read as linear."
-            warnings.append(CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB."))
-        elif by:
-            text = f"The images say that they are display-encoded ({by}), but are read as linear, as --transfer says."
-            warnings.append(
-                CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Leave it out if their values are not linear.")
+        curve, *others = {image.curve.curve for image in images}
+        if others:
+            text = (
+                f"The images look display-encoded ({by}) but are read as linear. Add --transfer srgb if they are sRGB."
             )
-        return self, warnings
+            return self, [*warnings, CaptureWarning(codes.DISPLAY_ENCODED, text)]
+        if curve not in (1, BT709):  # a film has no other curve
+            how = "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}" if curve else "sRGB"
+            text = f"The images say that they are display-encoded ({by}) and are read as {how}."
+            text += " Add --transfer linear if their values are linear."
+            warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
+        return replace(self, curve=curve), warnings
 
 
 AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images state a curve
 AS_STORED = RadiometricCalibration()  # stored values are linear light
-
 EVERY_PIXEL = slice(None)
 
 
-_MIDDLE_OF_8_BITS = np.float32(0.25 / 255)
-"""Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does not record which. A
-value v then represents light between v - 0.5 and v + 0.5, or between v and v + 1. Adding a quarter of a step halves the
-error in both cases; in dark pixels, this error changes the normals."""
-
-
 def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float32Array:
-    """Return stored values of any shape as linear light. Raises InputError as to_linear does."""
+    """Return stored values of any shape as linear light. Raises InputError as to_linear does.
+
+    Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does not record which. A
+    value v then represents light between v - 0.5 and v + 0.5, or between v and v + 1. Adding a quarter of a step halves
+    the error in both cases; in dark pixels, this error changes the normals.
+    """
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
-        linear += _MIDDLE_OF_8_BITS * (stored > 0)
+        linear += np.float32(0.25 / 255) * (stored > 0)
     return linear
 
 
@@ -225,7 +208,7 @@ def pixel_reader(
         mean = linear[: len(stored)].mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
-        return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
+        return np.asarray(np.maximum(linear / mean, 0.02), np.float32)  # darker places do not show the falloff
 
     if radiometry.ambient is not None:
         ambient = pixels(radiometry.ambient)[1]
@@ -300,7 +283,7 @@ def collect_observations(
         text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."
         warnings.append(CaptureWarning(codes.SATURATED, text))
     black = (n_pixels - np.count_nonzero(observations[:n_pixels].any(axis=1))) / max(n_pixels, 1)
-    if black > BLACK_SHARE:
+    if black > 0.01:
         text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
         text += " Leave them out with a mask or with --auto-mask."
         warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))

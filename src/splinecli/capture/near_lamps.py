@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +28,12 @@ from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.pixel_grid import ray_basis
 from splinecli.system.files import is_substitution
 
-_LEAST_SHARE = 0.05
-"""Least intensity of a lobe. Observations are divided by it, and so is their noise. Outside, a pixel looks shadowed."""
-
 
 @dataclass(frozen=True, eq=False)
 class NearLamps:
     """F lamps as points of light, over an image of known scale.
 
-    Raises:
-        InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
+    Raises InputError if a position is not finite or not in front of the object, or the pixel size is not above 0.
     """
 
     positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
@@ -92,9 +88,8 @@ class NearLamps:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the lamps as JSON values: their distances from the origin, and the scale."""
-        distances = np.linalg.norm(self.positions, axis=1)
         return {
-            "distances": distances.round(4).tolist(),
+            "distances": np.linalg.norm(self.positions, axis=1).round(4).tolist(),
             "pixel_size": self.pixel_size,
             "camera": "orthographic" if self.camera_matrix is None else "perspective",
             "camera_matrix": None if self.camera_matrix is None else self.camera_matrix.tolist(),
@@ -103,8 +98,7 @@ class NearLamps:
 
     def turned(self, directions: Float64Array) -> NearLamps:
         """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
-        distances = np.linalg.norm(self.positions, axis=1, keepdims=True)
-        return replace(self, positions=directions * distances)
+        return replace(self, positions=directions * np.linalg.norm(self.positions, axis=1, keepdims=True))
 
     def choose_lights(self, positions: Sequence[int]) -> NearLamps:
         """Return some of the lamps, in the order given."""
@@ -154,21 +148,9 @@ class NearLamps:
 def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
     """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
-    return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=_LEAST_SHARE)
+    # Observations are divided by the lobe, and so is their noise. Outside, a pixel looks shadowed.
+    return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=0.05)
 
-
-NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
-
-INSIDE = 0.5
-"""A lamp is refused if its distance from the middle of the object is below this share of the smaller of the object's
-width and height: it would be inside the object, or hide it from the camera."""
-
-CLOSE, FAR = 1.0, 300.0
-"""Distances, in the larger of the object's width and height, that carry a warning: below the first, and above the
-second. A position in metres instead of millimetres changes the distance a thousandfold."""
-
-_SHORTEST_POSITION, _UNEQUAL_LENGTHS = 3.0, 1.02
-"""Vectors of a file of directions are probably positions above this length, if the longest is so much longer."""
 
 UNIT_HINT = (
     "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the pixel size or object"
@@ -185,12 +167,17 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
     text = f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is {sizes[0]:.3g} wide"
-    if distances[nearest] < INSIDE * min(sizes):
+    if distances[nearest] < 0.5 * min(sizes):
         raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
-    if distances[nearest] < CLOSE * max(sizes):
+    if distances[nearest] < max(sizes):
         return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
-    if distances[nearest] > FAR * max(sizes):
-        return [CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")]
+    # A position in metres instead of millimetres changes the distance a thousandfold.
+    if distances[nearest] > 300.0 * max(sizes):
+        return [
+            CaptureWarning(
+                LAMP_DISTANCE, f"The lamps are so far away that their light is parallel: {text}. {UNIT_HINT}."
+            )
+        ]
     return []
 
 
@@ -204,7 +191,7 @@ def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools)
         text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
         return [CaptureWarning(NEAR_LAMPS, text)]
     angle_deg = lamps.angles_across_deg(mask).max()
-    if angle_deg <= NEAR_DEG:
+    if angle_deg <= 2.0:
         return []
     text = (
         f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
@@ -223,7 +210,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
         return []  # a file of angles
     vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]
     lengths = np.hypot.reduce(vectors, axis=1)
-    if len(lengths) < 3 or lengths.min() < _SHORTEST_POSITION or lengths.max() < _UNEQUAL_LENGTHS * lengths.min():
+    if len(lengths) < 3 or lengths.min() < 3.0 or lengths.max() < 1.02 * lengths.min():
         return []
     text = (
         f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g}, as positions of"
@@ -232,37 +219,11 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     return [CaptureWarning(NEAR_LAMPS, text)]
 
 
-PIXEL_SIZE = ("pixel_size.txt",)
-CAMERA_MATRIX = ("camera_matrix.txt",)
-LOBES = ("light_lobes.txt",)
-_MOST_NARROW = 100  # the exponent of a lamp whose intensity halves 7 degrees off its axis
-
-SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
-
-
-class LitSource(Protocol):
-    """The part of CaptureSource that near lamps depend on."""
-
-    @property
-    def n_lights(self) -> int: ...
-    @property
-    def light_directions(self) -> Float64Array: ...
-    @property
-    def light_frame(self) -> LightFrame: ...
-    @property
-    def intensities_measured(self) -> bool: ...
-    @property
-    def window(self) -> Window: ...
-    @property
-    def camera_matrix(self) -> Float64Array | None: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class LampOptions:
     """The user's options for near lamps and the camera. All lengths have the same unit, such as millimetres.
 
-    Raises:
-        UsageError: a number is not above 0, or two options contradict each other.
+    Raises UsageError if a number is not above 0, or two options contradict each other.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
@@ -290,7 +251,6 @@ class LampOptions:
         return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
 
-_FARTHEST = 1e15  # of a lamp. float32 holds the squares of distances up to 1e19
 _OPTIONS = {
     "positions": "--light-positions",
     "distance": "--light-distance",
@@ -321,24 +281,29 @@ class LampFiles:
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
         return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
-    def over(self, source: LitSource, mask: Bools, *, step: int = 1) -> NearLamps | None:
-        """Return all lamps of a capture over a mask (H, W) with every step-th row and column; None without a scale."""
-        window, frame, equal = source.window, source.light_frame, not source.intensities_measured
+    def over(self, source: Any, mask: Bools, *, step: int = 1) -> NearLamps | None:
+        """Return all lamps of a CaptureSource over a mask (H, W) of every step-th row and column; None without a scale.
+
+        Raises InputError.
+        """
+        window: Window = source.window
+        camera_matrix: Float64Array | None = source.camera_matrix
         if self.positions is not None:
-            positions = read_light_positions(self.positions, source.n_lights, frame)
+            positions = read_light_positions(self.positions, source.n_lights, source.light_frame)
         else:
-            assert self.distance is not None
             positions = source.light_directions * self.distance
-        if (farthest := np.abs(positions).max(initial=0)) > _FARTHEST:
+        # float32 holds the squares of distances up to 1e19.
+        if (farthest := np.abs(positions).max(initial=0)) > 1e15:
             raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
-        pixel_size, camera_matrix = self.pixel_size, source.camera_matrix
+        pixel_size = self.pixel_size
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
             pixel_size = self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
         if pixel_size is None:
             return None
         shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
-        lobes = None if self.lobes is None else _read_lobes(self.lobes, positions, frame)
+        lobes = None if self.lobes is None else _read_lobes(self.lobes, positions, source.light_frame)
+        equal = not source.intensities_measured
         lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes)
         left, top, *_ = window.box or (0, 0)
         step *= window.step
@@ -355,7 +320,11 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         InputError: a file is wrong, or positions are the only lights and their scale is unknown.
         UsageError: an option needs positions, and there are none.
     """
-    positions, used = _find_positions(folder, lights, options)
+    positions, used = _path(options.positions), True
+    if positions is None and options.distance is None:
+        positions, used = find_named(folder, LIGHT_POSITIONS), lights is None
+        if positions is None and lights is not None and lights.is_file():
+            positions = find_named(lights.parent, LIGHT_POSITIONS)
     if positions is None and options.distance is None:
         if options.given is not None:
             problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
@@ -363,14 +332,14 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
     scaled = options.pixel_size is not None or options.object_width is not None
-    pixel_file = None if scaled else _find(folders, PIXEL_SIZE)
+    pixel_file = None if scaled else _find(folders, "pixel_size.txt")
     scaled = scaled or pixel_file is not None
-    lobes = _find(folders, LOBES)
-    files = (positions, pixel_file, lobes)
-    stamp = tuple(stamp_content(path) for path in files if path is not None)
+    lobes = _find(folders, "light_lobes.txt")
+    stamp = tuple(stamp_content(path) for path in (positions, pixel_file, lobes) if path is not None)
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
-        raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
+        hint = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+        raise InputError("the scale of the lamp positions is unknown", path=positions, hint=hint)
     return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
 
 
@@ -382,21 +351,11 @@ def find_camera(
     Raises InputError if the file is wrong.
     """
     folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
-    path = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
+    path = _path(options.camera_matrix) or _find(folders, "camera_matrix.txt")
     if path is None:
         return None, ()
-    stamp = stamp_content(path)
+    stamp = stamp_content(path)  # before it is read
     return read_camera_matrix(path), (stamp,)
-
-
-def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
-    """Return the file of positions, and whether to use positions rather than distant lights."""
-    if options.positions is not None or options.distance is not None:
-        return _path(options.positions), True
-    in_folder = find_named(folder, LIGHT_POSITIONS)
-    if lights is None or in_folder is not None or not lights.is_file():
-        return in_folder, lights is None
-    return find_named(lights.parent, LIGHT_POSITIONS), False
 
 
 def _path(name: str | None) -> Path | None:
@@ -415,12 +374,13 @@ def read_camera_matrix(path: Path) -> Float64Array:
 
 def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float64Array:
     """Return the lobes (F, 4) of NearLamps for lamps at positions (F, 3). Raises InputError."""
-    hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
+    hint = "A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to 100"
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
         raise InputError(f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
     for numbers, line, text in rows:
-        if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= _MOST_NARROW:
+        # With an exponent of 100, the intensity halves 7 degrees off the axis.
+        if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= 100:
             raise InputError(f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint)
     rows *= len(positions) // len(rows)
     lobes = np.array([row.numbers for row in rows])
@@ -446,5 +406,5 @@ def _read_pixel_size(path: Path) -> float:
     return size
 
 
-def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:
-    return next((path for folder in folders if (path := find_named(folder, names)) is not None), None)
+def _find(folders: list[Path], name: str) -> Path | None:
+    return next((path for folder in folders if (path := find_named(folder, [name])) is not None), None)

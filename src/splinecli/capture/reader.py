@@ -11,31 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splinecli import capture_warnings as codes
+from splinecli.capture import linearise, near_lamps
 from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
 from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_content, stamp_files
 from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import NamedLights, read_light_intensities, read_lights, unit_directions
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
-from splinecli.capture.linearise import (
-    AUTOMATIC,
-    WHOLE,
-    RadiometricCalibration,
-    StoredPixels,
-    Window,
-    collect_observations,
-    linear_light,
-    take_around,
-)
-from splinecli.capture.near_lamps import (
-    NO_LAMP_OPTIONS,
-    LampOptions,
-    NearLamps,
-    check_distances,
-    find_camera,
-    find_lamps,
-    positions_as_directions,
-)
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeholders
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture_warnings import ESTIMATED_COLOURS, CaptureWarning
@@ -55,12 +37,12 @@ def open_capture(
     intensities: StrPath | None = None,
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
-    radiometry: RadiometricCalibration = AUTOMATIC,
+    radiometry: linearise.RadiometricCalibration = linearise.AUTOMATIC,
     white_level: float | None = None,
     light_frame: LightFrame = USUAL_FRAME,
     lights_format: LightForm = "xyz",
-    lamps: LampOptions = NO_LAMP_OPTIONS,
-    window: Window = WHOLE,
+    lamps: near_lamps.LampOptions = near_lamps.NO_LAMP_OPTIONS,
+    window: linearise.Window = linearise.WHOLE,
     find_lights: LightFinder | None = None,
     lights_in_channels: bool = False,
     crosstalk: StrPath | None = None,
@@ -94,7 +76,7 @@ def open_capture(
     if lamps.positions is not None and lights is not None:
         raise UsageError("--lights and --light-positions contradict each other", hint="Leave one out")
     form: RowForm = lights_format
-    near = None if find_lights is not None else find_lamps(Path(folder), overrides.lights, lamps)
+    near = None if find_lights is not None else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
             problem = f"--light-format {lights_format} concerns light directions, but {near.positions} has positions"
@@ -105,7 +87,7 @@ def open_capture(
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
-    camera_matrix, of_camera = find_camera(Path(folder), near, lamps)
+    camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, lamps)
     channels, matrix_file = None, None
     if lights_in_channels:
         matrix_file = Path(crosstalk) if crosstalk is not None else find_named(files.folder, (CROSSTALK,))
@@ -131,7 +113,7 @@ def open_capture(
     if channels is not None:
         warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
     if files.light_directions is not None and form == "xyz" and near is None:
-        warnings += positions_as_directions(files.light_directions)
+        warnings += near_lamps.positions_as_directions(files.light_directions)
     facts = tuple(map(read_header, files.images))
     factors = np.ones((len(facts), 3))
     if found_intensities is None and (exposures := exposure_factors(facts)) is not None:
@@ -219,7 +201,7 @@ def _read_lights(
         return _drop_bad_lights(files, lights, None, warnings)
     images, how = lights.match(files.images)
     if len(images) < len(files.images):
-        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
+        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others were left out."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."
@@ -254,14 +236,14 @@ def _match_count(
     try:
         return images, read_lights(path, len(images), frame, form)
     except InputError as error:
-        for key in (_stated_size, _name_form):
+        for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
             keys = [key(image) for image in images]
             usual = Counter(keys).most_common(1)[0][0]
             alike = tuple(image for image, of_image in zip(images, keys, strict=True) if of_image == usual)
             if len(alike) < len(images):
                 with suppress(InputError):
                     return alike, read_lights(path, len(alike), frame, form)
-        found = _COUNTS.match(error.problem)
+        found = re.match(r"found (\d+) [a-z ]+, expected \d+, one for each image", error.problem)
         if found is None or int(found[1]) >= len(images):
             raise
         names = [image.name for image in images[int(found[1]) :]]
@@ -269,16 +251,9 @@ def _match_count(
         raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 
-_COUNTS = re.compile(r"found (\d+) [a-z ]+, expected \d+, one for each image")
-
-
 def _stated_size(image: Path) -> tuple[int, ...] | None:
     size = read_header(image).stated_size
     return None if size is None else size[0][:2]
-
-
-def _name_form(image: Path) -> str:
-    return re.sub(r"\d+", "0", image.name.lower())
 
 
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Float64Array:
@@ -343,19 +318,19 @@ def capture_from_arrays(
     around = None if as_stored else surroundings(inside)
     sizes = int(inside.sum()), n_lights, white_level, 0 if around is None else int(around.sum())
 
-    def pixels() -> Iterator[StoredPixels]:
+    def pixels() -> Iterator[linearise.StoredPixels]:
         for index, image in enumerate(stack):
             pixels = image if image.ndim == 3 else image[..., None]
             values, path = pixels[inside], Path(f"images[{index}]")
-            used = values if around is None else np.concatenate((values, take_around(pixels, around)))
-            yield StoredPixels(path, values, linear_light(used, path), intensities[index])
+            used = values if around is None else np.concatenate((values, linearise.take_around(pixels, around)))
+            yield linearise.StoredPixels(path, values, linearise.linear_light(used, path), intensities[index])
 
-    observations, saturation, warnings, colours = collect_observations(pixels(), *sizes)
+    observations, saturation, warnings, colours = linearise.collect_observations(pixels(), *sizes)
     if as_stored:
         warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
     if colours is not None:
         intensities = intensities * colours
-        observations = collect_observations(pixels(), *sizes)[0]
+        observations = linearise.collect_observations(pixels(), *sizes)[0]
     blur = None if around is None else remove_blur(observations, inside, around)
     observations = observations[: sizes[0]]
     indices, level = tuple(range(n_lights)), saturation.white_level
@@ -365,8 +340,8 @@ def capture_from_arrays(
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
-        lamps = NearLamps.of(positions, pixel_size, shape, equal=not known, camera_matrix=matrix)
-        warnings = [*warnings, *check_distances(lamps, inside, None)]
+        lamps = near_lamps.NearLamps.of(positions, pixel_size, shape, equal=not known, camera_matrix=matrix)
+        warnings = [*warnings, *near_lamps.check_distances(lamps, inside, None)]
         capture = replace(capture, lamps=lamps, camera_matrix=None, warnings=tuple(warnings))
     stored = StoredCapture(capture, saturation, intensities_known=known)
     if light_directions is None and find_lights is not None:
@@ -393,9 +368,8 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
 def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
     vectors = np.asarray(directions, np.float64)
     if vectors.shape != (n_lights, 3):
-        raise UsageError(
-            f"found light directions of shape {vectors.shape}, expected (F, 3) = {(n_lights, 3)}, one for each image"
-        )
+        expected = f"(F, 3) = {(n_lights, 3)}, one for each image"
+        raise UsageError(f"found light directions of shape {vectors.shape}, expected {expected}")
     if not np.isfinite(vectors).all():
         raise InputError("a light direction is not finite")
     rows = [f" in row {row}" for row in range(n_lights)]

@@ -17,18 +17,8 @@ from splinecli.restoration.images import Saturation, WhiteLevel, restore_saturat
 from splinecli.restoration.lamps import estimate_light_intensities
 from splinecli.surface.pixel_grid import ray_basis
 
-SIDES_DEG = {
-    "right": 0.0,
-    "upper-right": 45.0,
-    "above": 90.0,
-    "upper-left": 135.0,
-    "left": 180.0,
-    "lower-left": 225.0,
-    "below": 270.0,
-    "lower-right": 315.0,
-}
-"""Azimuths of the sides of an image: counter-clockwise from the right."""
-
+_SIDES = ("right", "upper-right", "above", "upper-left", "left", "lower-left", "below", "lower-right")
+SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}  # azimuths, counter-clockwise from the right
 ESTIMATE = "estimate"  # given instead of a light file: the lights are estimated from the images
 
 
@@ -42,14 +32,9 @@ class FoundLights:
 
 
 def azimuth_of(first_light: str) -> float:
-    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number of degrees.
-
-    Raises UsageError for other text.
-    """
-    if first_light in SIDES_DEG:
-        return SIDES_DEG[first_light]
+    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number. Raises UsageError."""
     try:
-        azimuth = float(first_light)
+        azimuth = SIDES_DEG[first_light] if first_light in SIDES_DEG else float(first_light)
     except ValueError:
         azimuth = np.nan
     if not abs(azimuth) <= 360:
@@ -69,24 +54,13 @@ def placeholders(n_lights: int) -> Float64Array:
 LightFinder = Callable[[Float32Array, Bools, bool], FoundLights]
 """Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""
 
-
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
-
-COPLANAR_RATIO = 1e-3
-"""Lights (F, 3) are considered coplanar if their smallest singular value is below this share of the largest."""
-
 _UNIT_TOLERANCE = 1e-3
-_DTYPES = {
-    "observations": np.float32,
-    "light_directions": np.float64,
-    "mask": np.bool_,
-    "ground_truth": np.float32,
-    "estimated_intensities": np.float64,
-    "estimated_colours": np.float64,
-    "restored": np.bool_,
-    "camera_matrix": np.float64,
+_DTYPES: dict[type[np.generic], tuple[str, ...]] = {
+    np.float32: ("observations", "ground_truth"),
+    np.float64: ("light_directions", "estimated_intensities", "estimated_colours", "camera_matrix"),
+    np.bool_: ("mask", "restored"),
 }
-_BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy of a large capture
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +118,14 @@ class Capture:
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
-        for name, dtype in _DTYPES.items():
-            values = getattr(self, name)
-            object.__setattr__(self, name, None if values is None else np.asarray(values, dtype))
+        for dtype, names in _DTYPES.items():
+            for name in names:
+                values = getattr(self, name)
+                object.__setattr__(self, name, None if values is None else np.asarray(values, dtype))
         object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
         object.__setattr__(self, "warnings", tuple(self.warnings))
         self._check_lights()
-        self._check_observations()
-        self._check_ground_truth()
+        self._check_pixels()
         if self.camera_matrix is not None:
             ray_basis(self.camera_matrix)
 
@@ -166,12 +140,8 @@ class Capture:
     def choose_lights(self, positions: Sequence[int]) -> Capture:
         """Return the same capture under some of its lights, in the order given.
 
-        Args:
-            positions: zero-based positions among this record's lights, not indices in the whole capture.
-
-        Raises:
-            UsageError: a position is out of range or repeated, or there are fewer than three.
-            InputError: the chosen lights are coplanar.
+        The positions are zero-based, among this record's lights. Raises the errors of check_light_indices, and
+        InputError if the chosen lights are coplanar.
         """
         chosen = list(check_light_indices(positions, self.n_lights))
         return replace(
@@ -223,7 +193,7 @@ class Capture:
             problem = f"{self.name}: the {len(lights)} lights lie in one plane, so least squares (LS) cannot solve"
             raise InputError(f"{problem} for a normal", hint="Choose lights that surround the viewing direction")
 
-    def _check_observations(self) -> None:
+    def _check_pixels(self) -> None:
         if self.mask.ndim != 2:
             raise InputError(f"{self.name}: a mask of shape {self.mask.shape}, expected (H, W)")
         n_pixels = int(np.count_nonzero(self.mask))
@@ -233,26 +203,22 @@ class Capture:
         self._check_shape("restored flags", self.restored, (n_pixels, self.n_lights), "(pixels, lights) = ")
         if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
             raise InputError(f"{self.name}: an observation is not finite")
-
-    def _check_shape(self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = "") -> None:
-        if array is not None and array.shape != shape:
-            raise InputError(f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}")
-
-    def _check_ground_truth(self) -> None:
-        if self.ground_truth is None:
-            return
         self._check_shape("ground truth", self.ground_truth, (*self.mask.shape, 3), "(H, W, 3) = ")
-        for block in _blocks(self.ground_truth.reshape(-1, 3)):
+        for block in [] if self.ground_truth is None else _blocks(self.ground_truth.reshape(-1, 3)):
             length = np.linalg.norm(block, axis=1)
             # In this form, NaN fails the check, too.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
                 raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
 
+    def _check_shape(self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = "") -> None:
+        if array is not None and array.shape != shape:
+            raise InputError(f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}")
+
 
 def in_one_plane(light_directions: Float64Array) -> bool:
     """Return whether lights (F, 3) are coplanar, so that Capture rejects them."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
-    return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
+    return bool(singular_values[-1] < 1e-3 * singular_values[0])
 
 
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
@@ -266,15 +232,16 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
             problem = f"light index {index} is out of range: the capture has {n_lights} lights"
             raise UsageError(problem, hint=f"Light indices count from 0 to {n_lights - 1}")
         if index in chosen[:position]:
-            raise UsageError(f"light index {index} comes twice", hint="Name each light once")
+            raise UsageError(f"light index {index} is listed twice", hint="Name each light once")
     if len(chosen) < MIN_LIGHTS:
         raise UsageError(f"{len(chosen)} lights chosen, expected at least {MIN_LIGHTS}")
     return chosen
 
 
-def _blocks(rows: Float32Array) -> Iterator[Float32Array]:
-    for start in range(0, len(rows), _BLOCK):
-        yield rows[start : start + _BLOCK]
+def _blocks(rows: Float32Array, size: int = 1 << 20) -> Iterator[Float32Array]:
+    """Yield some rows at a time, so that a check needs no second copy of a large capture."""
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]
 
 
 def name_reading(*, as_stored: bool) -> str:
@@ -333,21 +300,19 @@ class StoredCapture:
 
         The observations are changed in place: this record must not be used afterwards.
         """
-        observations, warnings, restored = self.capture.observations, self.capture.warnings, None
+        observations, warnings = self.capture.observations, self.capture.warnings
         if intensities is not None:
             observations /= intensities.astype(np.float32)
-            lowest, highest = (f"{value:.2f}" for value in (intensities.min(), intensities.max()))
-            if lowest == highest:
-                lowest, highest = (f"{value:.4f}" for value in (intensities.min(), intensities.max()))
+            lowest, highest = intensities.min(), intensities.max()
+            digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
             text = (
-                "The light intensities were estimated from the images: they are unequal, from"
-                f" {lowest} to {highest} times their mean. Use --intensities FILE if you"
-                " have measured them, or --intensities equal to assume equal ones."
+                f"The light intensities were estimated from the images: they are unequal, from {lowest:.{digits}f} to"
+                f" {highest:.{digits}f} times their mean. Use --intensities FILE if you have measured them, or"
+                " --intensities equal to assume equal ones."
             )
             warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
         saturated = self.saturation.flags
-        if saturated is not None:
-            restored = restore_saturated(observations, saturated, self._lights_of)
+        restored = None if saturated is None else restore_saturated(observations, saturated, self._lights_of)
         if intensities is None and restored is None:
             return self.capture
         return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)

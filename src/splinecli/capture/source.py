@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from splinecli.capture import linearise
 from splinecli.capture.channel_lights import ChannelLights
 from splinecli.capture.files import CaptureFiles
 from splinecli.capture.formats.decoders import stderr_is_apart
@@ -25,18 +26,7 @@ from splinecli.capture.formats.images import (
 )
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
-from splinecli.capture.linearise import (
-    AS_STORED,
-    EVERY_PIXEL,
-    WHOLE,
-    RadiometricCalibration,
-    StoredPixels,
-    Window,
-    collect_observations,
-    pixel_reader,
-    take_around,
-    take_pixels,
-)
+from splinecli.capture.linearise import AS_STORED, WHOLE, RadiometricCalibration, StoredPixels, Window
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import (
@@ -64,13 +54,11 @@ from splinecli.restoration.lens_blur import remove_blur, surroundings
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
+# Bytes of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while.
 BYTES_OF_RESULTS = 52
-"""Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
+Progress = Callable[[], object]  # called once after each image
 
 LEAST_COMMON = 0.25  # share of the object that all aligned images must show
-_IMAGES = 2  # images in memory while read_ahead reads them
-_IMAGES_OF_MASK = 3  # images whose brightness outside the mask is checked
-Progress = Callable[[], object]  # called once after each image
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +147,7 @@ class CaptureSource:
             around = surroundings(mask)
             n_around = int(np.count_nonzero(around))
         images = self.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
-        collected = collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
+        collected = linearise.collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
         observations, saturation, warnings, colours = collected
         equal = self.intensities_known and not self.intensities_measured
         if equal or as_stored or not divide_colours:
@@ -180,20 +168,19 @@ class CaptureSource:
             warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
         warnings += [*of_lamps, *self.mask_warnings(mask, indices)]
+        camera = None if lamps is not None or self.camera_matrix is None else self.window.camera(self.camera_matrix)
         capture = Capture(
-            name=self.files.name,
-            observations=observations,
-            light_directions=self.light_directions[list(indices)],
-            light_indices=indices,
-            mask=mask,
-            ground_truth=ground_truth,
-            warnings=tuple(warnings),
+            self.files.name,
+            observations,
+            self.light_directions[list(indices)],
+            indices,
+            mask,
+            ground_truth,
+            tuple(warnings),
             white_level=saturation.white_level,
             removed_blur=blur,
             lamps=None if lamps is None else lamps.choose_lights(indices),
-            camera_matrix=None
-            if lamps is not None or self.camera_matrix is None
-            else self.window.camera(self.camera_matrix),
+            camera_matrix=camera,
         )
         stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
@@ -272,8 +259,7 @@ class CaptureSource:
             mask = np.any([decode_image(path, expected).max(axis=2) > 0 for path in files.boundaries], axis=0)
             if not mask.any():
                 names = " and ".join(path.name for path in files.boundaries)
-                problem = f"the mask is empty: every pixel of {names} is zero"
-                raise InputError(problem, path=files.boundaries[0].parent)
+                raise InputError(f"the mask is empty: every pixel of {names} is zero", path=files.boundaries[0].parent)
         elif files.mask is not None:
             mask = read_mask(files.mask, expected)
         mask = self.window.of(mask)
@@ -290,7 +276,7 @@ class CaptureSource:
         path = self.files.mask
         if path is None or self.automatic_mask is not None or not surrounds_hole(mask):
             return []
-        few = [indices[place] for place in np.linspace(0, len(indices) - 1, _IMAGES_OF_MASK).astype(int)]
+        few = [indices[place] for place in np.linspace(0, len(indices) - 1, 3).astype(int)]
         images = self.read_pixels(np.ones_like(mask), few, StoredPixels.observe)
         brightness = np.sum(list(images), axis=0).reshape(mask.shape)
         return [mask_inverted(path.name)] if looks_inverted(mask, brightness) else []
@@ -324,7 +310,7 @@ class CaptureSource:
         indices: Sequence[int],
         use: Callable[[StoredPixels], Item],
         progress: Progress = lambda: None,
-        wanted: Integers | slice = EVERY_PIXEL,
+        wanted: Integers | slice = linearise.EVERY_PIXEL,
         around: Bools | None = None,
     ) -> Iterator[Item]:
         """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
@@ -333,7 +319,7 @@ class CaptureSource:
         if an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
-        pixels_of = pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
+        pixels_of = linearise.pixel_reader(self.radiometry, mask, len(self.facts), like, self.window, wanted, around)
         if self.alignment is not None:
             pixels_of = self._aligned_reader(self.alignment.transforms, mask, like, wanted, around)
 
@@ -355,16 +341,18 @@ class CaptureSource:
     ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
         """Return what pixel_reader returns, of images that are moved back as a whole."""
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
-        read = pixel_reader(self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1))
+        read = linearise.pixel_reader(
+            self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1)
+        )
 
         def pixels(path: Path, index: int) -> tuple[Array, Float32Array]:
             of_file, light = read(path, index)
             moved = resample(of_file.reshape(*whole.shape, -1), light.reshape(*whole.shape, -1), transforms[index])
             stored, linear = self.window.of(moved[0]), self.window.of(moved[1])
-            used = take_pixels(linear, mask)[wanted]
+            used = linearise.take_pixels(linear, mask)[wanted]
             if around is not None:
-                used = np.concatenate((used, take_around(linear, around)))
-            return take_pixels(stored, mask), used
+                used = np.concatenate((used, linearise.take_around(linear, around)))
+            return linearise.take_pixels(stored, mask), used
 
         return pixels
 
@@ -390,7 +378,7 @@ def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the memory in bytes that `infer` needs for a capture: float32 observations, and images or results."""
-    images = min(_IMAGES, n_lights) * image_bytes(*largest)
+    images = min(2, n_lights) * image_bytes(*largest)  # read_ahead has two
     return n_pixels * 4 * n_lights + max(images, n_pixels * BYTES_OF_RESULTS)
 
 

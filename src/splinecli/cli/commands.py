@@ -162,7 +162,7 @@ def train(options: TrainOptions) -> None:
     curves.png and maps.png into RUN. After Ctrl-C, --resume continues from the checkpoint. Settings come from the
     preset, then from --config, then from the other options. With torchrun, several processes train together.
     """
-    from splinecli.training.config_files import parse_parameter, parse_sources
+    from splinecli.training.config import parse_parameter, parse_sources
     from splinecli.training.loop import configure_run, open_run
 
     changes: list[dict[str, Any]] = []  # in the order of their precedence

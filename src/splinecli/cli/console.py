@@ -23,9 +23,9 @@ from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer
 
 DEFECT = "this is a defect of splinecli; please report it with the lines above."  # for unexpected errors
-NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for invalid arguments
+# Click's texts as regular expressions, and the words that replace them
 _SYNTAX = (
     (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
     (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
@@ -34,8 +34,6 @@ _SYNTAX = (
     (r"^Missing command\.?$", "a command is missing"),
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
-"""Click's texts as regular expressions, and the words that replace them."""
-
 RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}  # options of earlier versions
 
 
@@ -46,7 +44,8 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, ParserError):
         return _usage_message(error), UsageError.exit_code
     if is_out_of_memory(error):
-        return NO_MEMORY, SplinecliError.exit_code
+        problem = "there is not enough memory. Close other programs, or use smaller images."
+        return problem, SplinecliError.exit_code
     if isinstance(error, OSError):
         return explain(as_splinecli_error(error))
     return DEFECT, SplinecliError.exit_code
@@ -97,20 +96,17 @@ def _usage_message(error: Any) -> str:
 
 
 def _unknown_name(error: Any) -> str | None:
+    def suggestion(names: list[str]) -> str:
+        return f" Did you mean {listed(names)}?" if any(names) else ""
+
     text = error.format_message()
     option = getattr(error, "option_name", None)
     if option in RENAMED:
         return f"{option} is now {RENAMED[option]}."
     if option and hasattr(error, "possibilities"):
-        return f"no option {option}.{_suggestion(sorted(error.possibilities or ()))}"
+        return f"no option {option}.{suggestion(sorted(error.possibilities or ()))}"
     command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
-    if command:
-        return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
-    return None
-
-
-def _suggestion(names: list[str]) -> str:
-    return f" Did you mean {listed(names)}?" if any(names) else ""
+    return f"no command {command[1]}.{suggestion((command[2] or '').strip('?').split(', '))}" if command else None
 
 
 LINE_SECONDS = 30.0  # seconds between two progress lines if stderr is not a terminal
@@ -141,17 +137,14 @@ class Messages(Observer):
         self.quiet = quiet
 
     def say(self, message: str) -> None:
-        """Print a line."""
         if not self.quiet:
             print(printable(message), file=sys.stderr)
 
     def warn(self, message: str) -> None:
-        """Print a line that begins with "splinecli: warning:"."""
         self.say(f"splinecli: warning: {message}")
 
     def error(self, message: str) -> None:
-        """Print a line that begins with "splinecli:", even with `quiet`."""
-        print(f"splinecli: {printable(message)}", file=sys.stderr)
+        print(f"splinecli: {printable(message)}", file=sys.stderr)  # even with `quiet`
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:
         """Print a table: a header row, then rows of a name and numbers."""
@@ -170,7 +163,6 @@ class Messages(Observer):
 
     @contextmanager
     def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
-        """Show the progress of a stage; yields `advance(amount, note="")`, which moves it."""
         if self.quiet:
             yield lambda amount, note="": None
         elif sys.stderr.isatty():

@@ -109,9 +109,6 @@ def _summary(report: dict[str, Any], output: Path) -> str:
     return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"
 
 
-_LOOK_SECONDS = 1.0  # time between two looks at the folder
-
-
 def watch(context: Context, options: WatchOptions) -> None:
     """Run infer on each capture that arrives in FOLDER, once it is complete.
 
@@ -129,9 +126,8 @@ def watch(context: Context, options: WatchOptions) -> None:
     if given["as_json"]:
         raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
     if given["shard"] is not None:
-        raise UsageError(
-            "--shard splits a list of captures, and watch has none", hint="Watch one folder for each shard"
-        )
+        hint = "Watch one folder for each shard"
+        raise UsageError("--shard splits a list of captures, and watch has none", hint=hint)
     if len(given["captures"]) > 1:
         raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
     if output.resolve() == folder.resolve():
@@ -147,7 +143,7 @@ def watch(context: Context, options: WatchOptions) -> None:
             run.params["captures"] = ready
             infer.invoke(run)
         else:
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(1.0)
         try:
             ready = arrivals.take()
             if not is_there:
@@ -170,16 +166,7 @@ def info(reading: Reading, options: InfoOptions) -> int:
     from splinecli.pipeline.info import describe_capture, summary_lines
 
     messages = Messages(quiet=options.quiet)
-    report = describe_capture(
-        options.capture,
-        reading,
-        messages,
-        plot=options.plot,
-        overwrite=options.overwrite,
-        check_lights=options.check_lights,
-        auto_mask=options.auto_mask,
-        mended_lights=options.mended_lights,
-    )
+    report = describe_capture(options, reading, messages)
     print_report(report, *summary_lines(report), as_json=options.as_json, quiet=options.quiet)
     wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
     if reading.strict and wrong:

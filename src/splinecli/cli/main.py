@@ -1,7 +1,4 @@
-"""The Typer app, and the entry point, which turns every error into an exit code.
-
-Importing it must stay cheap: no torch, no OpenCV.
-"""
+"""The Typer app, and the entry point, which turns every error into an exit code. Importing it must stay cheap."""
 
 import io
 import json
@@ -19,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from splinecli import __version__
 from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
@@ -29,9 +26,7 @@ from splinecli.cli.options import command, help_of
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.system.machine import check_address_space, keep_freed_memory
 
-HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Typer breaks it at 80
-INFER = "infer"  # the command whose JSON is a list of documents
-JSON, JSON_LINES = "--json", "--jsonl"
+INFER, JSON = "infer", "--json"  # the command whose JSON is a list of documents, and the option that asks for it
 
 _FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
     "splinecli.pipeline.infer_options": (infer, watch, info),
@@ -59,7 +54,7 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. The context is added to parser errors, so that the message names the command."""
-        wants_json, wants_lines = JSON in args, JSON_LINES in args  # the parser removes them from the list
+        wants_json, wants_lines = JSON in args, "--jsonl" in args  # the parser removes them from the list
         try:
             return super().parse_args(ctx, args)
         except ParserError as error:
@@ -75,29 +70,30 @@ class Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Run the command. A shell expands `~` in `-o ~/x`, but not in `--output=~/x`."""
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
+
+        def run() -> Any:
+            try:
+                return super(Command, self).invoke(ctx)
+            except EOFError as error:  # click would treat it as an interruption by the user
+                raise RuntimeError("unexpected end of a file") from error
+
         try:
             check_address_space()
             keep_freed_memory()
             if ctx.info_name != INFER:
-                return self._run(ctx)
+                return run()
             with printed_documents(as_list=ctx.params["as_json"], as_lines=ctx.params["as_json_lines"]) as ctx.obj:
-                return self._run(ctx)
+                return run()
         except Exception as error:
             if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
                 print(json.dumps(error_document(error), indent=2))
             raise
 
-    def _run(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except EOFError as error:  # click would treat it as an interruption by the user
-            raise RuntimeError("unexpected end of a file") from error
-
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Return the completions of a word, each with one line of help: shells treat a second line as another word."""
         items = super().shell_complete(ctx, incomplete)
-        for item in items:
-            item.help = textwrap.shorten(item.help or "", HINT_WIDTH, placeholder=" ...")
+        for item in items:  # Typer breaks the help beside an option at 80 columns
+            item.help = textwrap.shorten(item.help or "", 72, placeholder=" ...")
         return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -112,14 +108,13 @@ class Command(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help, without the Python types of arguments."""
-        arguments: list[Any] = [parameter for parameter in self.params if parameter.param_type_name == "argument"]
-        for argument in arguments:
-            argument.display_type_rich = lambda ctx: None
+        for parameter in self.params:
+            if parameter.param_type_name == "argument":
+                parameter.display_type_rich = lambda ctx: None  # type: ignore[attr-defined]
         super().format_help(ctx, formatter)
 
 
 def _expand(value: Any) -> Any:
-    """Return a value with `~` and `~user` at the beginning of a text or path replaced by the home folder."""
     if isinstance(value, str | Path) and not isinstance(value, Enum):
         return type(value)(os.path.expanduser(value))  # noqa: PTH111 - Path.expanduser raises for an unknown user
     if isinstance(value, list | tuple):
@@ -127,8 +122,19 @@ def _expand(value: Any) -> Any:
     return value
 
 
+class Commands(TyperGroup):
+    """The command splinecli itself."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, without the Python types of flags."""
+        for option in self.get_params(ctx):
+            option.metavar = ""
+        super().format_help(ctx, formatter)
+
+
 app = typer.Typer(
     name="splinecli",
+    cls=Commands,
     help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
     rich_markup_mode="rich",
@@ -200,7 +206,6 @@ class UntilClosed:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text and return its length."""
         try:
             return self._stream.write(text)
         except BrokenPipeError:
@@ -208,7 +213,6 @@ class UntilClosed:
             return len(text)
 
     def flush(self) -> None:
-        """Flush the buffer."""
         try:
             self._stream.flush()
         except BrokenPipeError:
@@ -218,7 +222,6 @@ class UntilClosed:
         return getattr(self._stream, name)
 
     def _mute(self) -> None:
-        """Redirect the stream, including its buffered output, to the null device."""
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, self._stream.fileno())
         os.close(null)

@@ -9,12 +9,8 @@ from types import FrameType
 
 INTERRUPTED = 130  # exit code of an interrupted process
 GRACE_SECONDS = 1.5  # time that the command has to clean up
-
-
 TOLD = threading.Event()  # set when the command reports the interruption itself, to avoid a second message
 DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
-_IMPORT_SECONDS = 0.05  # time between two checks of whether an import is finished
-_IMPORTS = "<frozen importlib._bootstrap>"
 
 
 def end_on_signals() -> None:
@@ -51,9 +47,9 @@ def report_interruption() -> int:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt, or defer it until an import is done: trimesh, for one, continues after any exception."""
     while frame is not None:
-        if frame.f_code.co_filename == _IMPORTS:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             DEFERRED.set()
-            again = threading.Timer(_IMPORT_SECONDS, signal.raise_signal, (number,))
+            again = threading.Timer(0.05, signal.raise_signal, (number,))
             again.daemon = True
             again.start()
             return
@@ -64,7 +60,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(reader: int) -> None:
-    """Read the numbers of the signals that arrive, and end the process some time after a SIGTERM."""
     while os.read(reader, 1) != bytes([signal.SIGTERM]):
         pass
     time.sleep(GRACE_SECONDS)

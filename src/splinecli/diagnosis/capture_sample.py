@@ -35,7 +35,6 @@ class CaptureSample:
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
-    intensities_known: bool  # whether they are given, or the user states that they are equal
     intensities: Float64Array | None = None  # (F,), the given ones, by which the observations were divided
     estimated: Float64Array | None = None  # (F,), the estimated ones, by which the sample was not divided
     eight_bit: bool = False  # whether the images have 8 bits
@@ -61,7 +60,7 @@ class CaptureSample:
         strict: bool = False,
     ) -> CaptureSample:
         """Return the checks' input for the images with these indices, from the capture's files, sample and closeup."""
-        (sample, closeup), lamps = samples, source.lamps
+        (sample, closeup), lamps, measured = samples, source.lamps, source.intensities_measured
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
             single = page_of(images[0])[0] == images[0] and source.channels is None
@@ -72,11 +71,8 @@ class CaptureSample:
             indices,
             sample,
             closeup,
-            source.intensities_measured,
-            source.intensities_known,
-            intensities=gray_intensities(source.light_intensities[list(indices)])
-            if source.intensities_measured
-            else None,
+            measured,
+            intensities=gray_intensities(source.light_intensities[list(indices)]) if measured else None,
             eight_bit=any((source.facts[index].stated_size or ((), 0))[1] == 1 for index in indices),
             lamps=lamps.over(source, sample.mask, step=sample.step) if lamps is not None and lamps.used else None,
             has_positions=lamps is not None,
@@ -160,7 +156,6 @@ class CaptureSample:
         return check_lights(values[known], mask, self.all_directions, self.indices, self.names, factors)
 
     def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
-        """Return shifts by place, in pixels of the sample."""
         step = self.sample.step
         return {shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts}
 

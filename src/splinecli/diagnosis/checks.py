@@ -22,15 +22,9 @@ from splinecli.maths.normals import angle_between_deg
 from splinecli.restoration.lamps import estimate_light_intensities
 
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
-
-
+# Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
+# ones, no reading reduces the residual as much. Intensities are an exception: on flat objects they explain any order.
 DECISIVE = 0.35
-"""Largest ratio of residuals at which another reading shows that lights and images belong together: with wrong or moved
-ones, no reading reduces the residual as much. Intensities are an exception, because on flat objects they explain any
-order."""
-
-
-_FITS, _LIT, _LEAST_PIXELS = 6, 0.3, 30  # of the check of scales: lit pixels are above this share of a pixel's median
 _MOST_NAMED = 4  # shifted images in a sentence
 
 
@@ -51,10 +45,10 @@ def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
     """Warn of an image with the values of a camera of fewer bits than the files of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
     values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)  # one image may be much brighter
-    predicted = fit_robustly(values, np.ones_like(values), lights, _FITS)[0] @ lights.T
-    lit = predicted > _LIT
+    predicted = fit_robustly(values, np.ones_like(values), lights, 6)[0] @ lights.T
+    lit = predicted > 0.3  # of a pixel's median
     for place, name in enumerate(seen.names):
-        if np.count_nonzero(lit[:, place]) < _LEAST_PIXELS:
+        if np.count_nonzero(lit[:, place]) < 30:
             continue
         factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
         stops = abs(np.log2(max(factor, 1e-6)))
@@ -126,9 +120,8 @@ def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
         first, second = (seen.names[place] for place in pairs[0])
         others = len(pairs) - 1
         more = f" (and {others} more pair{'s' if others > 1 else ''})" if others else ""
-        text = (
-            f"{first} and {second} are the same image{more}{differ}. Remove one, or replace it by its own photograph."
-        )
+        text = f"{first} and {second} are the same image{more}{differ}."
+        text += " Remove one, or replace it by its own photograph."
         # Either image of a pair may be the wrong one.
         wrong = [sorted({pair[which] for pair in pairs}) for which in (0, 1)] if differ else []
         errors_deg = [error for places in wrong if (error := _turn_by_deg(seen, places)) is not None]
@@ -220,47 +213,37 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
 
 
 REPEATED = frozenset({codes.REPEATED_IMAGES})  # if the lights differ, these contradict all others
-
+# After these warnings, no check that relies on the lights is reliable.
 DOUBTED = REPEATED | {
     codes.IMAGES_SHIFTED, codes.IMAGE_INCONSISTENT, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_ILL_CONDITIONED
 }  # fmt: skip
-"""After these warnings, no check that relies on the lights is reliable."""
-
+# After these warnings, the normals do not determine the lights' frame, nor the images their order.
 READ_OTHERWISE = frozenset({codes.NONLINEARITY_SUSPECTED, codes.NEAR_LIGHTS_SUSPECTED, codes.CONSTANT_LIGHT})
-"""After these warnings, the normals do not determine the lights' frame, nor the images their order."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """A row of CHECKS.
-
-    find: returns warnings of the faults that it finds.
-    unless: earlier warnings after which it is skipped.
-    needs_lights: whether it is skipped if the lights were estimated from the images.
-    """
+    """A row of CHECKS."""
 
     find: Callable[[CaptureSample], Iterable[CaptureWarning]]
-    unless: frozenset[WarningKind] = frozenset()
-    needs_lights: bool = True
+    unless: frozenset[WarningKind] = frozenset()  # earlier warnings after which it is skipped
+    needs_lights: bool = True  # whether it is skipped if the lights were estimated from the images
 
 
+# The checks of a capture's lights and images, in their order
 CHECKS = [
     Check(same_images, needs_lights=False),
     Check(lambda seen: other_readings(seen, DECISIVE), REPEATED),
     Check(shifted_images, READ_OTHERWISE, needs_lights=False),
     Check(other_scale, REPEATED),
     Check(odd_image, REPEATED | {codes.IMAGE_SCALE}),
-    Check(
-        lambda seen: light_warnings(seen.light_check, seen.origin, seen.frame, strict=seen.strict),
-        REPEATED | READ_OTHERWISE,
-    ),
+    Check(lambda s: light_warnings(s.light_check, s.origin, s.frame, s.strict), REPEATED | READ_OTHERWISE),
     Check(missing_mask, needs_lights=False),
     Check(crowded_lights),
     Check(lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
     Check(other_readings, DOUBTED | READ_OTHERWISE),
     Check(rough_lights, DOUBTED | READ_OTHERWISE),
 ]
-"""The checks of a capture's lights and images, in their order."""
 
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
@@ -283,7 +266,6 @@ def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list
         range(n_lights),
         sample,
         closeup,
-        intensities is not None,
         intensities is not None,
         intensities=None if intensities is None else gray_intensities(intensities),
         estimated=capture.estimated_intensities,

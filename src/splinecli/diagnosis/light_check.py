@@ -1,41 +1,36 @@
 """Detect light directions in a wrong frame or order, from the images and the normals that they give.
 
-The thresholds were chosen on captures that splinecli's own renderer made (MERL's measured materials, CyclesPS's
-classes of materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the
-figures.
+The thresholds were chosen on captures of splinecli's own renderer (MERL's measured materials, CyclesPS's classes of
+materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the figures.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from splinecli import capture_warnings as codes
 from splinecli.capture.light_rows import BOTH_NEGATED, PLANE_FRAMES, LightFrame
 from splinecli.capture_warnings import CaptureWarning
-from splinecli.diagnosis.light_order import HALF_VECTORS, ORDER, UNKNOWN_ORDER, ZENITH, check_order
+from splinecli.diagnosis.light_order import (
+    FEWEST_LIGHTS,
+    HALF_LEFT,
+    HALF_VECTORS,
+    LARGEST_MENDED,
+    UNKNOWN_ORDER,
+    ZENITH,
+    check_order,
+)
 from splinecli.diagnosis.odd_images import OddImage, find_odd_image
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import RoughNormals, ShadowCheck, median_turn_deg, rough_normals
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 
-
-@dataclass(frozen=True)
-class FrameLimits:
-    """Weights and thresholds of the advantage of a frame; from 1 on, it is better."""
-
-    curl_weight: float = 5.0  # of a ratio of curls: its logarithm
-    rim_weight: float = 1.0  # of a difference of rims
-    told_apart: float = 0.5  # the smallest difference of advantages that distinguishes two frames
-    lowest_curl: float = 0.1  # less is noise; on a spherical cap, other frames give little more
-    rotated: float = 2.0  # of lights rotated by any angle: it is fitted, so it wins a little by noise
-    rim_from: float = 0.3  # share of steep pixels at the rim; with fewer, the mask's edge is not an outline
-    rim_fully: float = 0.6  # from here on, the outline has full weight
-
-
-FRAME = FrameLimits()
+# The advantage of a frame: the weight of a difference of rims, the smallest difference that distinguishes two frames,
+# and what lights rotated by any angle need, because the angle is fitted. From 1 on, a frame is better.
+_RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -57,25 +52,17 @@ class LightCheck:
     """The result of comparing the light directions with the images."""
 
     candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
-    # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
-    order: str | None
-    # distances between the images and the lights in the given order and in the better one, as shares of the median of
-    # random orders; NaN with too few lights
-    given_misfit: float
-    order_misfit: float
-    # the reading that gives better normals; None if there is none. Its frame is relative to the given one
-    best: Candidate | None
+    order: str | None  # a reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
+    given_misfit: float  # residual in the given order, as a share of random orders'; NaN with too few lights
+    order_misfit: float  # the same in the better order
+    best: Candidate | None  # the reading that gives better normals, if any. Its frame is relative to the given one
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
-    # (F, 3), the lights of the observations in the best reading; None if the given one is the best, or no reading
-    # clearly is
-    mended: Float64Array | None
-    # the median angle by which the given lights change the normals, if the best reading is right; None if the given is
-    error_deg: float | None = None
+    mended: Float64Array | None  # (F, 3), in the best reading; None for the given one, or if none clearly is best
+    error_deg: float | None = None  # median angle by which the given lights change the normals, if `best` is right
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
     lacks_shadows: bool = False  # whether they contradict the given lights, without supporting others
-    # an image that contradicts the others, without which all this was found; None if there is none
-    odd_image: OddImage | None = None
+    odd_image: OddImage | None = None  # an image that contradicts the others, without which all this was found
 
     @property
     def given(self) -> Candidate:
@@ -86,7 +73,7 @@ class LightCheck:
         """The properties of the lights that the images leave undetermined, in words."""
         missing = []
         if np.isnan(self.given_misfit):
-            missing.append(f"their order (fewer than {ORDER.min_lights} lights, too few lit pixels, or a flat object)")
+            missing.append(f"their order (fewer than {FEWEST_LIGHTS} lights, too few lit pixels, or a flat object)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
@@ -98,7 +85,7 @@ class LightCheck:
     @property
     def outline_tells(self) -> bool:
         """Whether the outline shows that x and y are not both negated."""
-        return bool(2 * FRAME.rim_weight * self.outline_counts * abs(np.nan_to_num(self.given.rim)) >= 1)
+        return bool(2 * _RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) >= 1)
 
 
 def check_lights(
@@ -109,13 +96,9 @@ def check_lights(
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
 ) -> LightCheck:
-    """Compare observations (P, F) of a mask (H, W) with their lights.
+    """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of light_directions (N, 3).
 
-    Args:
-        light_directions: (N, 3), all lights of the capture, in the order of the file.
-        indices: the F lights of the observations; None for all.
-        names: of the F images, for the words of the result.
-        factors: of the observations, if they were found before.
+    `names` are those of the F images, for the words of the result, and `factors` those of the observations.
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
@@ -145,8 +128,8 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
-    weight = (normals.rim_steepness - FRAME.rim_from) / (FRAME.rim_fully - FRAME.rim_from)
-    weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
+    # The share of steep pixels at the rim below which the mask's edge is not an outline, and from which it fully is.
+    weight = float(np.clip((normals.rim_steepness - 0.3) / (0.6 - 0.3), 0, 1)) if found.plausible else 0.0
 
     def candidate(name: str, frame: LightFrame | None, matrix: Float64Array, **kind: Any) -> Candidate:
         turned = normals.transformed(matrix)
@@ -158,11 +141,13 @@ def _check_frame_and_order(
     judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
     # If no order fits, the normals are not evidence.
     fits = found.order != UNKNOWN_ORDER and bool(np.isfinite(given.curl))
-    evidence = _by_shadows(judged, given, ShadowCheck.of(observations, found.lights, normals)) if fits else None
-    judged = judged if evidence is None else evidence.judged
+    shadows_tell = lacks_shadows = False
+    if fits:
+        shadows = ShadowCheck.of(observations, found.lights, normals)
+        judged, shadows_tell, lacks_shadows = _by_shadows(judged, given, shadows)
     ranked = sorted(judged, key=lambda other: -other.advantage)
     # Rotations are listed only if they matter.
-    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= FRAME.rotated]
+    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= _ROTATED]
     order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
     if best is not None:
@@ -181,13 +166,13 @@ def _check_frame_and_order(
         order, best = best.name, None  # one of several orders that fit, chosen by the normals
     check = LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None)
     tie = best is not None and mirror_twin(check, best) is not None
-    clear = not tie and not found.misfit > ORDER.mended
+    clear = not tie and not found.misfit > LARGEST_MENDED
     return replace(
         check,
         mended=mended if clear else None,
         error_deg=turn_deg,
-        shadows_tell=evidence is not None and evidence.tell,
-        lacks_shadows=evidence is not None and evidence.missing and not (order or best or check.outline_tells),
+        shadows_tell=shadows_tell,
+        lacks_shadows=lacks_shadows and not (order or best or check.outline_tells),
     )
 
 
@@ -205,14 +190,11 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
             yield f"{negated}rotated by {degrees:.0f} degrees about the view axis", matrix
 
 
-class _ShadowEvidence(NamedTuple):
-    judged: list[Candidate]  # with it
-    tell: bool  # whether shadows exclude the given lights with x and y negated
-    missing: bool  # whether the given lights lack shadows
+def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -> tuple[list[Candidate], bool, bool]:
+    """Return candidates after cast shadows separated the given reading and the best other one from their twins.
 
-
-def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -> _ShadowEvidence:
-    """Return candidates after cast shadows separated the given reading and the best other one from their twins."""
+    Also return whether shadows exclude the given lights with x and y negated, and whether the given lights lack some.
+    """
     shadows, best = check.shadows(given.matrix), max(judged, key=lambda other: other.advantage)
     told = {}
     for one in (given, best):
@@ -227,11 +209,10 @@ def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -
         for other in judged
     ]
     both = next(other for name, (_, other) in told.items() if name == BOTH_NEGATED.describe())
-    return _ShadowEvidence(judged, shadows.evidence(both) < -FRAME.told_apart, shadows.leaves_open(both))
+    return judged, shadows.evidence(both) < -_TOLD_APART, shadows.leaves_open(both)
 
 
 def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:
-    """Return the candidate with x and y negated in addition."""
     matrix = BOTH_NEGATED.matrix @ one.matrix
     return next((other for other in candidates if np.allclose(other.matrix, matrix, atol=1e-6)), None)
 
@@ -240,7 +221,7 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     # Among near equals, a frame is preferred, or with `in_order` another order, because the order is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
-    if better and better[0].advantage > (simple[0].advantage if simple else 0) + FRAME.told_apart:
+    if better and better[0].advantage > (simple[0].advantage if simple else 0) + _TOLD_APART:
         better = [candidate for candidate in better if candidate not in simple] or better
     else:
         better = simple
@@ -251,15 +232,16 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
 
 
 def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
-    curls = np.log(max(given.curl, FRAME.lowest_curl) / max(other.curl, FRAME.lowest_curl))
+    lowest = 0.1  # less curl is noise; on a spherical cap, other frames give little more
+    curls = np.log(max(given.curl, lowest) / max(other.curl, lowest))
     rims = weight * (other.rim - given.rim)
-    return float(FRAME.curl_weight * np.nan_to_num(curls) + FRAME.rim_weight * np.nan_to_num(rims))
+    return float(5.0 * np.nan_to_num(curls) + _RIM_WEIGHT * np.nan_to_num(rims))
 
 
 def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
     """Return the reading with x and y also negated, if the evidence does not distinguish it from the best one."""
     twin = _negated(check.candidates, best)
-    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - FRAME.told_apart else None
+    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - _TOLD_APART else None
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
@@ -277,9 +259,7 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
 _WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
 
 
-def light_warnings(
-    check: LightCheck, light_file: Path, frame: LightFrame, *, strict: bool = False
-) -> list[CaptureWarning]:
+def light_warnings(check: LightCheck, light_file: Path, frame: LightFrame, strict: bool) -> list[CaptureWarning]:
     """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
 
     If `strict`, also warn of properties that the images leave undetermined, which is the case for most reliefs without
@@ -321,7 +301,7 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
         remedy = "Replace each elevation by 90 degrees minus it."
     elif check.order == HALF_VECTORS:
         remedy = f"Double the angle of each light from the camera axis, as {_WRITES_MENDED} does."
-        if check.order_misfit > ORDER.half_left * check.given_misfit:  # a ring, recognised by the albedo
+        if check.order_misfit > HALF_LEFT * check.given_misfit:  # a ring, recognised by the albedo
             return (
                 f"{light_file.name} probably contains half vectors, half-way between the lights and the camera axis:"
                 f" under them, steep slopes look brighter. {remedy}"

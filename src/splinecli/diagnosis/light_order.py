@@ -1,13 +1,12 @@
 """Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are shifted.
 
-A wrong order or frame of all lights is found here and by light_check.py. In a dome, single rings may also be shifted or
-mirrored against the others in the light file, because they begin at another lamp or run the other way round.
+In a dome, single rings may be shifted or mirrored against the others in the light file, because they begin at another
+lamp or run the other way round.
 
 Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
 others, as a brighter lamp would. For metals, this distinguishes right lights from wrong ones far better than known
-intensities do. On flat objects, however, free intensities explain any order.
-
-The thresholds were chosen on the same captures as in light_check.py.
+intensities do. On flat objects, however, free intensities explain any order. Thresholds are chosen as in
+light_check.py.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,9 +29,21 @@ from splinecli.lights.light_fit import (
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
 
-FEWEST_IN_RING = 4
+FEWEST_LIGHTS = 6  # fewer leave too few equations for the order
+HALF_LEFT = 0.6  # half vectors: doubled angles leave at most this share of the residual
+LARGEST_MENDED = 0.35  # residual of a better order; right lights of most metals have less
+# Residuals are shares of the median residual of random orders.
+_FOR_CHANCE = 8  # fewer lights fit in too many random orders; they use known intensities
+_RANDOM = 0.05  # of the brightness; below it, free intensities do not determine the order
+_FEWEST_IN_RING = 4
 _EQUAL = 1e-3  # share of the residual by which equal readings may differ
+_FITTED_PIXELS, _FITS = 800, 5
+UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
+# Readings of the light file in words: it has zenith angles, or lights half-way to the camera axis.
+ZENITH = "if their elevations count from the camera axis"
+HALF_VECTORS = "if they are half vectors, as the normals of a mirror ball at its highlights"
 
+# The step through the lamps of a ring, and the signs of x and y.
 _WAYS = {
     "": (1, 1, 1),
     "x negated": (1, -1, 1),
@@ -40,7 +51,6 @@ _WAYS = {
     "x and y negated": (1, -1, -1),
     "reversed": (-1, 1, 1),
 }
-"""The step through the lamps of a ring, and the signs of x and y."""
 
 
 def mend_rings(factors: Factors, lights: Float64Array) -> tuple[str, Float64Array, float]:
@@ -58,18 +68,21 @@ def mend_rings(factors: Factors, lights: Float64Array) -> tuple[str, Float64Arra
         starts = [[0] * len(rings), *anchored]
         found += [_descend(factors, lights, rings, trials, start) for start in dict.fromkeys(map(tuple, starts))]
     least = min(each.misfit for each in found)
-    best = min((each for each in found if each.misfit <= least * (1 + _EQUAL) + _EQUAL), key=lambda each: each.changes)
-    return _in_words(best.rings), best.lights, best.misfit
+    near_least = (each for each in found if each.misfit <= least * (1 + _EQUAL) + _EQUAL)
+    best = min(near_least, key=lambda each: (len(each.rings), sum(len(words) for _, words in each.rings)))
+    parts: dict[str, list[str]] = {}  # the lights of rings by their correction: "with lights 9 to 16 shifted by +1"
+    for lamps, words in best.rings:
+        whole = len(lamps) == lamps[-1] - lamps[0] + 1
+        numbers = f"{lamps[0] + 1} to {lamps[-1] + 1}" if whole else ", ".join(map(str, lamps + 1))
+        parts.setdefault(words, []).append(numbers)
+    named = "; ".join(f"lights {', '.join(numbers)} {words}" for words, numbers in parts.items())
+    return f"with {named}" if named else "", best.lights, best.misfit
 
 
 class _Mended(NamedTuple):
     lights: Float64Array  # (F, 3)
     misfit: float
     rings: list[tuple[Integers, str]]  # the lights of each ring that is read otherwise, and how
-
-    @property
-    def changes(self) -> tuple[int, int]:
-        return len(self.rings), sum(len(words) for _, words in self.rings)
 
 
 _Trials = list[list[tuple[str, Float64Array]]]  # of each ring, its readings; the first as given
@@ -119,7 +132,7 @@ def find_rings(lights: Float64Array) -> Iterator[list[Integers]]:
     # Lights belong to one ring if their elevations follow each other at smaller steps.
     by_elevation = np.split(order, np.flatnonzero(np.diff(elevation[order]) > 3.0) + 1)
     for division in (by_elevation, _rounds(lights)):
-        rings = [np.sort(ring) for ring in division if len(ring) >= FEWEST_IN_RING]
+        rings = [np.sort(ring) for ring in division if len(ring) >= _FEWEST_IN_RING]
         if len(division) > 1 and rings:
             yield rings
 
@@ -134,7 +147,7 @@ def _rounds(lights: Float64Array) -> list[Integers]:
     rings, first = list[Integers](), 0
     for last in range(1, len(lights)):
         gone, count = float(steps[first:last].sum()), last - first
-        if count >= FEWEST_IN_RING - 1 and abs(gone) > 2 * np.pi * count / (count + 1.5):
+        if count >= _FEWEST_IN_RING - 1 and abs(gone) > 2 * np.pi * count / (count + 1.5):
             rings.append(np.arange(first, last + 1))
             first = last + 1
     inner = [steps[ring[:-1]] for ring in rings]
@@ -152,55 +165,6 @@ def _readings(given: Float64Array) -> Iterator[tuple[str, Float64Array]]:
             yield " and ".join(filter(None, (way, shift))), directions
 
 
-def _in_words(mended: Sequence[tuple[Integers, str]]) -> str:
-    """Return words for corrected rings, from their lights and their words: "with lights 9 to 16 shifted by +1"."""
-    parts: dict[str, list[str]] = {}
-    for lamps, words in mended:
-        parts.setdefault(words, []).append(_numbers(lamps + 1))
-    named = "; ".join(f"lights {', '.join(lights)} {words}" for words, lights in parts.items())
-    return f"with {named}" if named else ""
-
-
-def _numbers(numbers: Integers) -> str:
-    whole = len(numbers) == numbers[-1] - numbers[0] + 1
-    return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
-
-
-@dataclass(frozen=True)
-class OrderLimits:
-    """Thresholds of the order of the lights. Residuals are shares of the median residual of random orders."""
-
-    min_lights: int = 6  # fewer leave too few equations
-    better: float = 0.6  # the largest share of the given residual that a better order leaves
-    better_of_few: float = 0.4  # the same for few lights
-    few: int = 8
-    mended: float = 0.35  # the largest residual of a better order; right lights of most metals have less
-    wrong: float = 0.25  # the smallest residual of a wrong order
-    swapped: float = 0.08  # the same where two lights are exchanged
-    for_chance: int = 8  # fewer lights fit in too many random orders; they use known intensities
-    random: float = 0.05  # of the brightness; below it, free intensities do not determine the order
-    residual: float = 0.2  # of the factors; with more, and few lights, metals fit like a random order
-    of_metal: int = 12  # from here on, metals are judged
-    half_left: float = 0.6  # half vectors: doubled angles leave at most this share
-    half_misfit: float = 0.04  # of a residual above this,
-    half_worse: float = 0.05  # and are worse by at most this under any kind of intensities
-
-
-ORDER = OrderLimits()
-
-
-UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
-
-ZENITH = "if their elevations count from the camera axis"
-"""The reading of lights whose file has zenith angles instead of elevations, in words."""
-
-HALF_VECTORS = "if they are half vectors, as the normals of a mirror ball at its highlights"
-"""The reading of lights half-way between the true ones and the camera axis, in words."""
-
-
-_FITTED_PIXELS, _FITTED_ORDERS, _FITS = 800, 9, 5
-
-
 class Turn(NamedTuple):
     """A shift of the lights that fits as well: in words, its steps, and the matrix (3, 3) that takes lights there."""
 
@@ -215,9 +179,7 @@ class LightOrder:
 
     order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
     lights: Float64Array  # (F, 3), in this order
-    intensities: (
-        Float64Array  # (F,), that fit these lights best, for metals; ones if only known ones determine the order
-    )
+    intensities: Float64Array  # (F,), of metals: those that fit best; ones if only known ones determine the order
     given_misfit: float = np.nan  # as a share of random orders'; NaN with too few lights
     misfit: float = np.nan  # the same for this order
     plausible: bool = True  # whether the lights fit well enough for the normals to show an outline
@@ -240,55 +202,54 @@ def check_order(
     chosen: Integers,
     names: Sequence[str],
 ) -> LightOrder:
-    """Return the order of the chosen lights that fits observations (P, F) best.
+    """Return the order of the `chosen` lights (F,) of light_directions (N, 3) that fits observations (P, F) best.
 
-    Args:
-        factors: of the observations; None if too few are lit.
-        light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
-        chosen: (F,) the lights of the observations.
+    `factors` are those of the observations; None if too few are lit. All lights are shifted and reversed together.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))
-    if factors is None or len(lights) < ORDER.min_lights:
+    if factors is None or len(lights) < FEWEST_LIGHTS:
         return unknown
     compared, random = _free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
-    if usual < ORDER.random and not factors.intensities_known:
+    if usual < _RANDOM and not factors.intensities_known:
         return unknown
-    given = _Reading(None, lights, float(compared.misfits(lights[None])[0]))
+
+    def reading(words: str | None, directions: Float64Array) -> _Reading:
+        return _Reading(words, directions, float(compared.misfits(directions[None])[0]))
+
+    given = reading(None, lights)
     shifted = light_directions[shifted_orders(n_all)[:, chosen]]
     misfits = compared.misfits(shifted)
     rows = 1 + int(misfits[1:n_all].argmin()), n_all + int(misfits[n_all:].argmin())
     shifts = [_Reading(_shift_words(row, n_all), shifted[row], float(misfits[row])) for row in rows]
-    exchanged, zenith = _best_exchange(compared, lights, names), zenith_as_elevation(lights)
-    of_angles = _Reading(ZENITH, zenith, float(compared.misfits(zenith[None])[0]))
+    exchanged, of_angles = _best_exchange(compared, lights, names), reading(ZENITH, zenith_as_elevation(lights))
     tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
     doubled = lights_of_half_vectors(lights)
     # Half vectors of lights above the horizon are within 45 degrees of the axis.
     if doubled[:, 2].min() > 0.0:
-        tried.append(_Reading(HALF_VECTORS, doubled, float(compared.misfits(doubled[None])[0])))
-    limit = min(
-        given.misfit * (ORDER.better_of_few if len(lights) <= ORDER.few else ORDER.better), ORDER.mended * usual
-    )
+        tried.append(reading(HALF_VECTORS, doubled))
+    # A better order leaves at most this share of the given residual, which is less for few lights.
+    limit = min(given.misfit * (0.4 if len(lights) <= 8 else 0.6), LARGEST_MENDED * usual)
     best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
     if tried[-1].words == HALF_VECTORS and _are_half_vectors(observations, factors, lights, doubled):
         found = tried[-1]
-    elif share > ORDER.wrong and best.misfit < limit:
+    elif share > 0.25 and best.misfit < limit:  # a wrong order has a larger residual
         found = best
-    elif share > ORDER.swapped and exchanged.misfit < limit:
+    elif share > 0.08 and exchanged.misfit < limit:  # where two lights are exchanged
         found = exchanged
     if found.words != HALF_VECTORS and found.misfit > 0.1 * usual and np.array_equal(chosen, np.arange(n_all)):
         rings = _Reading(*mend_rings(compared, lights))
         if rings.words:
             tried.append(rings)
-            if rings.misfit < min(found.misfit * 0.75, ORDER.mended * usual):
+            if rings.misfit < min(found.misfit * 0.75, LARGEST_MENDED * usual):
                 found = rings
     # On glossy plates, free intensities hide an order that fits well under the known ones.
     fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
     if found is given and not fits_known and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
     turns: tuple[Turn, ...] = ()
-    if any(found is shift for shift in shifts) or (found is given and share < ORDER.wrong):
+    if any(found is shift for shift in shifts) or (found is given and share < 0.25):
         turns = _turns(found.lights, shifted, misfits <= max(1.3 * found.misfit, 0.05 * usual))
     return LightOrder(
         found.words,
@@ -309,9 +270,9 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Float64Arr
         compared = replace(factors, intensities_known=known)
         usual = float(np.median(random_misfits(compared, lights)))
         given, other = compared.misfits(np.stack((lights, doubled))) / max(usual, 1e-9)
-        if other > given + ORDER.half_worse:
+        if other > given + 0.05:  # they may be worse by this much under any kind of intensities
             return False
-        better |= bool(given > ORDER.half_misfit and other < ORDER.half_left * given)
+        better |= bool(given > 0.04 and other < HALF_LEFT * given)
     return better or _brighten_as_half_vectors(observations, lights, doubled)
 
 
@@ -346,11 +307,12 @@ def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: F
     """Return whether lights fit no better than in random orders, whose residuals are given."""
     n_lights = len(given.lights)
     # An order is wrong if more than this share of random orders fits as well.
-    by_chance = n_lights >= ORDER.for_chance and (random <= given.misfit).mean() > 0.02
+    by_chance = n_lights >= _FOR_CHANCE and (random <= given.misfit).mean() > 0.02
     # An order is also wrong above this residual, as a share of random orders', if it is also this many times the
     # residual that remains under any lights, from highlights and shadows.
     unfit = given.misfit > 0.5 * np.median(random) and given.misfit > 6.0 * factors.residual
-    judged = factors.residual < ORDER.residual or n_lights >= ORDER.of_metal
+    # With larger residuals of the factors, and few lights, metals fit like a random order.
+    judged = factors.residual < 0.2 or n_lights >= 12
     return judged and bool(by_chance or unfit) and _fits_like_random(observations, factors, given.lights)
 
 
@@ -367,8 +329,8 @@ def _free_if_possible(factors: Factors, lights: Float64Array) -> tuple[Factors, 
     """Return factors to compare with lights of free intensities, if these determine orders, and random residuals."""
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
-    few = factors.intensities_known and len(lights) < ORDER.for_chance
-    if few or np.median(random) < ORDER.random:
+    few = factors.intensities_known and len(lights) < _FOR_CHANCE
+    if few or np.median(random) < _RANDOM:
         return factors, random_misfits(factors, lights) if factors.intensities_known else random
     return free, random
 
@@ -379,7 +341,7 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Float64Arr
     values = sample_pixels(observations)
     values = values[:: max(1, len(values) // _FITTED_PIXELS)]
     rng = np.random.default_rng(1)
-    orders = np.stack((lights, *(rng.permutation(lights) for _ in range(_FITTED_ORDERS))))
+    orders = np.stack((lights, *(rng.permutation(lights) for _ in range(9))))
     intensities = factors.intensities(orders)
     given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
     # Lights whose residual is below this share of the residual in random orders are not reported as wrong.

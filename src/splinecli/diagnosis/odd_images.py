@@ -2,10 +2,8 @@
 
 One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow fell on it. Each
 image is left out in turn. If the residual nearly vanishes without one image, and remains without any other, this one is
-odd. So is an image that the factors of rank 3 explain far less well than all others.
-
-The thresholds were chosen on the same captures as in light_check.py, after one image was dimmed, exchanged or half in
-shadow, or one light was moved by 40 degrees.
+odd. So is an image that the factors of rank 3 explain far less well than all others. Thresholds are chosen as in
+light_check.py, after one image was dimmed, exchanged or half in shadow, or one light was moved by 40 degrees.
 
 Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see light_fit). So each image
 can be predicted from the others under any light, and its fine detail is where the prediction has it. If it is
@@ -29,19 +27,6 @@ from splinecli.maths.normals import angle_between_deg
 
 
 @dataclass(frozen=True)
-class OddImageLimits:
-    """Thresholds of the check for a single image that contradicts the others."""
-
-    min_lights: int = 10  # with fewer, a correct image may seem odd by chance
-    min_misfit: float = 0.04  # of lights, one of whose images is odd, as a share of the brightness
-    residual: float = 0.2  # of the factors; with more, as on metals, residuals of lights are not conclusive
-    of_others: float = 0.15  # the same of the other images, for residuals
-
-
-ODD = OddImageLimits()
-
-
-@dataclass(frozen=True)
 class OddImage:
     """An image that contradicts the others."""
 
@@ -53,7 +38,7 @@ class OddImage:
 
 def find_odd_image(factors: Factors, light_directions: Float64Array) -> OddImage | None:
     """Return the image that contradicts the others under lights (F, 3), or None."""
-    if len(light_directions) < ODD.min_lights:
+    if len(light_directions) < 10:  # a correct image may seem odd by chance
         return None
     kinds = [factors] if factors.intensities_known else []
     for compared in (*kinds, factors.with_free_intensities()):
@@ -61,15 +46,14 @@ def find_odd_image(factors: Factors, light_directions: Float64Array) -> OddImage
         first, second = np.argsort(shares)[:2]
         # Largest residual without the odd image, and smallest one without any other, as shares of all images' residual.
         alone = shares[first] < 0.35 and shares[second] > 0.75
-        if alone and factors.residual < ODD.residual:
+        if alone and factors.residual < 0.2:  # with more, as on metals, residuals of lights are not conclusive
             brightness = _brightness(compared, light_directions, int(first))
             return OddImage(int(first), float(shares[first]), brightness)
     residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
     second, first = np.argsort(residuals)[-2:]
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
     # An odd image's residual is above the first, as a share of its brightness, and this many times any other's.
-    stands_out = residuals[first] > max(0.25, 2.5 * residuals[second])
-    if stands_out and left < ODD.of_others:
+    if residuals[first] > max(0.25, 2.5 * residuals[second]) and left < 0.15:
         return OddImage(int(first), left / factors.residual)
     return None
 
@@ -78,7 +62,7 @@ def _shares_left(factors: Factors, light_directions: Float64Array) -> Float64Arr
     """Return the root mean square residuals (F,) without each image, as shares of all images' residual."""
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
-    if misfit < ODD.min_misfit:
+    if misfit < 0.04:  # of lights, one of whose images is odd, as a share of the brightness
         return np.ones(n_lights)
     without = np.repeat(light_directions[None], n_lights, axis=0)
     diagonal = np.arange(n_lights)
@@ -100,18 +84,7 @@ def _brightness(factors: Factors, light_directions: Float64Array, place: int) ->
     return brightness if brightness > 0 and misfit < 0.3 else None
 
 
-@dataclass(frozen=True)
-class ShiftLimits:
-    """Thresholds of the check for images whose detail is shifted."""
-
-    largest: int = 8  # the largest shift that is looked for, in pixels of the sample
-    least_images: int = 10  # from fewer, polished metals are predicted so badly that right images are named
-    least_pixels: int = 1000  # that must stay in the mask under every shift
-    predictors: int = 5  # an image is predicted from three factors of four others or more
-    most_detail: float = 4.0  # in local contrasts, which limits the weight of highlights
-
-
-SHIFT = ShiftLimits()
+_LARGEST_SHIFT = 8  # the largest shift that is looked for, in pixels of the sample
 
 
 class ImageShift(NamedTuple):
@@ -129,9 +102,15 @@ class ImageShift(NamedTuple):
 
 def find_shifts(sample: Sample) -> list[ImageShift]:
     """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
+    import cv2
+
     values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
-    inner = _inner(sample.mask)
-    if values.shape[1] < SHIFT.least_images or np.count_nonzero(inner) < SHIFT.least_pixels:
+    # 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere
+    around = np.ones((2 * _LARGEST_SHIFT + 1, 2 * _LARGEST_SHIFT + 1), np.uint8)
+    eroded = cv2.erode(sample.mask.astype(np.float32), around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner = np.asarray(eroded, np.float32)
+    # From fewer images, polished metals are predicted so badly that right images are named.
+    if values.shape[1] < 10 or np.count_nonzero(inner) < 1000:
         return []
     values = values / np.maximum(values.mean(axis=0), 1e-9)
 
@@ -142,8 +121,8 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
 
     found = shifts_against(range(values.shape[1]))
     still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
-    # A shifted image also disturbs the prediction of others.
-    return shifts_against(still) if found and len(still) >= SHIFT.predictors else found
+    # A shifted image also disturbs the prediction of others. Four others or more predict an image.
+    return shifts_against(still) if found and len(still) >= 5 else found
 
 
 def _predictions(values: Float32Array, predictors: Sequence[int]) -> Iterator[Float32Array]:
@@ -163,32 +142,30 @@ def _shift(image: Float32Array, predicted: Float32Array, mask: Bools, inner: Flo
     detail, expected = _detail(image, mask), _detail(predicted, mask)
     correlations = _correlations(detail, expected, inner)
     right, down = _peak(correlations)
-    peak, unmoved = (
-        correlations[SHIFT.largest + down, SHIFT.largest + right],
-        correlations[SHIFT.largest, SHIFT.largest],
-    )
-    at_edge = max(abs(right), abs(down)) == SHIFT.largest  # the peak may be beyond
+    peak, unmoved = correlations[_LARGEST_SHIFT + down, _LARGEST_SHIFT + right], correlations[(_LARGEST_SHIFT,) * 2]
+    at_edge = max(abs(right), abs(down)) == _LARGEST_SHIFT  # the peak may be beyond
     # A shift is accepted if detail correlates so well at it, and so much better than without it. In captures without
     # shifts, of ten images and more, a polished metal reached 0.44 and 0.17.
     if at_edge or peak < 0.2 or peak - unmoved < 0.2:
         return None
-    around = correlations[SHIFT.largest + down - 1 :, SHIFT.largest + right - 1 :][:3, :3]
+    around = correlations[_LARGEST_SHIFT + down - 1 :, _LARGEST_SHIFT + right - 1 :][:3, :3]
     # The shortest shift that is accepted, in pixels of the sample. A tripod sinks by half a pixel.
     if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
         return None
     # A moved camera shifts the whole picture. The highlights of a polished relief move in different directions.
-    for half in _halves(inner):
-        of_half = _peak(_correlations(detail, expected, half))
-        if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
-            return None
+    for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
+        for half in (inner * (places <= middle), inner * (places > middle)):
+            of_half = _peak(_correlations(detail, expected, half))
+            if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
+                return None
     return right, down
 
 
 def _correlations(detail: Float32Array, expected: Float32Array, inner: Float32Array) -> Float32Array:
-    """Return the correlations of two images (H, W) at shifts down and right up to SHIFT.largest."""
+    """Return the correlations of two images (H, W) at shifts down and right up to _LARGEST_SHIFT."""
     import cv2
 
-    most = slice(SHIFT.largest, -SHIFT.largest)
+    most = slice(_LARGEST_SHIFT, -_LARGEST_SHIFT)
     template, weights = (np.ascontiguousarray(part[most, most]) for part in (expected, inner))
     found = cv2.matchTemplate(detail, template, cv2.TM_CCORR_NORMED, mask=weights)
     return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
@@ -196,14 +173,7 @@ def _correlations(detail: Float32Array, expected: Float32Array, inner: Float32Ar
 
 def _peak(correlations: Float32Array) -> tuple[int, int]:
     down, right = np.unravel_index(correlations.argmax(), correlations.shape)
-    return int(right) - SHIFT.largest, int(down) - SHIFT.largest
-
-
-def _halves(inner: Float32Array) -> Iterator[Float32Array]:
-    """Yield the left, right, upper and lower half of the pixels of a map (H, W)."""
-    for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
-        yield inner * (places <= middle)
-        yield inner * (places > middle)
+    return int(right) - _LARGEST_SHIFT, int(down) - _LARGEST_SHIFT
 
 
 def _top(before: float, middle: float, after: float) -> float:
@@ -228,30 +198,7 @@ def _detail(values: Float32Array, mask: Bools) -> Float32Array:
     contrast = blur(np.abs(detail), 4.0)
     # Detail fades out below this share of the mean contrast.
     detail /= contrast + 0.05 * np.abs(detail[mask]).mean() + np.float32(1e-12)
-    return np.asarray(detail.clip(-SHIFT.most_detail, SHIFT.most_detail), np.float32)
-
-
-def _inner(mask: Bools) -> Float32Array:
-    """Return 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere."""
-    import cv2
-
-    shifts = np.ones((2 * SHIFT.largest + 1, 2 * SHIFT.largest + 1), np.uint8)
-    return np.asarray(cv2.erode(mask.astype(np.float32), shifts, borderType=cv2.BORDER_CONSTANT, borderValue=0))
-
-
-@dataclass(frozen=True)
-class TruthLimits:
-    """Thresholds of the check of the ground truth."""
-
-    angle_deg: float = 20.0  # to the rough normals in another frame; metals reach 30 degrees in the right one
-    left: float = 0.5  # another frame leaves at most this share of the angle
-    reach: float = 0.15  # the largest shift, as a share of the smaller side of the object
-    shift_left: float = 0.65  # a shift leaves less of the angle, also after a rotation: on balls they are similar
-    fall_deg: float = 1.5  # and reduces it by so much
-    most_pixels: int = 4000  # of each comparison
-
-
-TRUTH = TruthLimits()
+    return np.asarray(detail.clip(-4.0, 4.0), np.float32)  # limits the weight of highlights
 
 
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
@@ -271,7 +218,8 @@ def check_ground_truth(sample: Sample, light_directions: Float64Array, truth: Fl
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals
     angles = [float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES]
     best = int(np.argmin(angles))
-    if angles[0] <= TRUTH.angle_deg or angles[best] > TRUTH.left * angles[0]:
+    # Metals reach 30 degrees in the right frame; another frame leaves at most half of the angle.
+    if angles[0] <= 20.0 or angles[best] > 0.5 * angles[0]:
         return _shifted(normals, truth, sample)
     frame = _FRAMES[best]
     kind, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
@@ -288,7 +236,7 @@ def check_ground_truth(sample: Sample, light_directions: Float64Array, truth: Fl
 def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[CaptureWarning]:
     """Warn of a ground truth (h, w, 3) that fits normals (h, w, 3) much better when it is moved."""
     rows, columns = np.nonzero(sample.mask)
-    reach = max(1, round(TRUTH.reach * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
+    reach = max(1, round(0.15 * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
     # Coarse to fine: the angle changes slowly with the shift.
     right, down, step = 0, 0, max(1, reach // 4)
     angles: dict[tuple[int, int], tuple[float, float]] = {}
@@ -302,10 +250,15 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
         right, down = min(angles, key=lambda moved: angles[moved][0] - angles[moved][1])
         step //= 2
     after, before = angles[right, down]
-    if (right, down) == (0, 0) or before - after < TRUTH.fall_deg or after > TRUTH.shift_left * before:
+    # A shift leaves less of the angle, also after a rotation, because on balls they are similar.
+    most_left = 0.65
+    if (right, down) == (0, 0) or before - after < 1.5 or after > most_left * before:
         return []
     known = normals.any(axis=2) & truth.any(axis=2)
-    if after > TRUTH.shift_left * _rotated_angle_deg(normals[known], truth[known]):
+    # The median angle after the best rotation (Kabsch 1976)
+    left, _, right_vectors = np.linalg.svd(normals[known].T @ truth[known])
+    rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right_vectors)))) @ right_vectors
+    if after > most_left * float(np.median(angle_between_deg(normals[known], truth[known] @ rotation.T))):
         return []
     directions = ((right, "right", "left"), (down, "down", "up"))
     named = " and ".join(
@@ -318,13 +271,6 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 
 
-def _rotated_angle_deg(normals: Float64Array, truth: Floats) -> float:
-    """Return the median angle between normals (P, 3) and a truth after the best rotation (Kabsch 1976)."""
-    left, _, right = np.linalg.svd(normals.T @ truth)
-    rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right)))) @ right
-    return float(np.median(angle_between_deg(normals, truth @ rotation.T)))
-
-
 def _angles_deg(normals: Float64Array, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:
     """Return the median angles in degrees between normals and a truth that is moved back, and not moved."""
     height, width = normals.shape[:2]
@@ -335,7 +281,7 @@ def _angles_deg(normals: Float64Array, truth: Floats, shift: tuple[int, int]) ->
     known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
     if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
         return 180.0, 0.0
-    every = slice(None, None, -(-int(np.count_nonzero(known)) // TRUTH.most_pixels))
+    every = slice(None, None, -(-int(np.count_nonzero(known)) // 4000))  # to save time
     own = normals[here][known][every]
     after, before = (float(np.median(angle_between_deg(own, other[known][every]))) for other in (moved, truth[here]))
     return after, before

@@ -20,47 +20,19 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.diagnosis.summary import Sample
 from splinecli.fits.robust import absolute_weights, fit_scaled_normals, lit_values, shade
-from splinecli.maths import Float64Array, Integers
+from splinecli.maths import Float64Array
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
-
-EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
+_EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
-WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-OFFSETS = tuple(0.02 * 1.5**k for k in range(16))  # constant light, over the value of a pixel that faces the light
-
+_WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
 COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
-
-EIGHT_BIT = 0.8  # subtracted from the cost of a curve if 8-bit images do not state that they are linear
-
-
 LIKELY = 0.5  # probability from which a reading is named
-
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
-
-
-@dataclass(frozen=True)
-class FitLimits:
-    """How readings are fitted; see Readings."""
-
-    min_lights: int = 4
-    for_median: int = 8  # from here on, the median residual is typical, else the mean
-    max_pixels: int = 400
-    max_observations: int = 16_000
-    min_pixels: int = 60
-    dark: float = 0.1  # of the brightest hundredth of the pixels; darker ones are background
-    shadow: float = 0.1  # of a pixel's largest value; smaller values are shadow
-    fits: int = 8
-    free_fits: int = 30  # with free intensities
-    offset_fits: int = 14  # with constant light
-    step: float = 1.5  # the exponent of each change of intensities, which saves a third of the fits
-    least: float = 1e-4  # added to residuals; 16 bits do not go below it
-
-
-FIT = FitLimits()
+_SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,22 +63,18 @@ class _Fit:
 
 
 class Readings:
-    """The pixels of a sample, and the readings that were fitted to them.
+    """The pixels of a sample, whose observations are as stored, and the readings that were fitted to them.
 
-    Args:
-        sample: its observations are as stored, not divided by intensities.
-        lights: (F, 3), unit.
-        intensities: (F,), those that were measured; None for equal ones.
-        eight_bit: whether the images have 8 bits and do not state that they are linear.
+    `lights` are (F, 3), unit; `intensities` (F,) those that were measured, or None for equal ones. `eight_bit` tells
+    whether the images have 8 bits and do not state that they are linear.
     """
 
     def __init__(
         self, sample: Sample, lights: Float64Array, intensities: Float64Array | None = None, *, eight_bit: bool = False
     ) -> None:
         n_lights = len(lights)
-        chosen, values = lit_values(
-            sample.observations, FIT.dark, min(FIT.max_pixels, FIT.max_observations // n_lights)
-        )
+        # Pixels below this share of the brightest hundredth are background.
+        chosen, values = lit_values(sample.observations, 0.1, min(400, 16_000 // n_lights))
         # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
         clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
         # Values at full scale look like a curve. Treated as shadows, they are ignored.
@@ -114,12 +82,12 @@ class Readings:
             values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
-        enough = (values > FIT.shadow).sum(axis=1) >= min(5, n_lights)
+        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
         self.shape, self.eight_bit = sample.mask.shape, eight_bit
-        self.are_enough = n_lights >= FIT.min_lights and len(self.values) >= FIT.min_pixels
+        self.are_enough = n_lights >= 4 and len(self.values) >= 60
 
     def fit(self, kinds: Collection[Kind]) -> list[Reading]:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
@@ -181,24 +149,30 @@ class Readings:
     def _best_curve(self, *, free: bool = False) -> Reading:
         vectors, shadow = self._with(self.lights), 0.35  # encoded shadows are brighter
         given = _fit(self.values, vectors, free=free, shadow=shadow)
-        fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in EXPONENTS}
-        return _best("curve", fits, given, -EIGHT_BIT if self.eight_bit else 0.0)
+        fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in _EXPONENTS}
+        return _best("curve", fits, given, -0.8 if self.eight_bit else 0.0)
 
     def _best_near(self, given: _Fit) -> Reading:
         """Return the best distance. Intensities are free: near lamps look unequal, and unequal lamps may be near."""
-        fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in WIDTHS}
+        fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in _WIDTHS}
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the position, like the light of near lamps. An object is round if its normals
-        # predict this share of the variance of the places; then near lamps cost so much more.
-        cost = 1.9 if _roundness(best.normals, places) > 0.85 else 0.0
-        # At an end of WIDTHS, the residual may fall beyond.
-        cost += 1.3 if best.amount in (WIDTHS[0], WIDTHS[-1]) else 0.0
+        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a cubic function
+        # of the slopes of its normals predicts this share of the variance of the places; near lamps then cost more.
+        across = unit(best.normals)[:, :2]
+        cubic = across * (across**2).sum(axis=1, keepdims=True)
+        terms = np.concatenate((across, cubic, np.ones((len(across), 1))), axis=1)
+        missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
+        roundness = float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
+        cost = 1.9 if roundness > 0.85 else 0.0
+        # At an end of the distances, the residual may fall beyond.
+        cost += 1.3 if best.amount in (_WIDTHS[0], _WIDTHS[-1]) else 0.0
         return replace(best, evidence=best.evidence - cost)
 
     def _offset_fits(self, vectors: Float64Array) -> dict[float, _Fit]:
-        """Return fits with constant light, also between the two of OFFSETS around the best one."""
-        fits = {offset: _fit(self.values, vectors, offset=offset) for offset in OFFSETS}
+        """Return fits with constant light, over the value of a pixel that faces the light, and around the best one."""
+        offsets = (0.02 * 1.5**k for k in range(16))
+        fits = {offset: _fit(self.values, vectors, offset=offset) for offset in offsets}
         for _ in range(3):  # halve the interval around the best constant light
             tried = sorted(fits)
             best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
@@ -223,7 +197,8 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     """
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
-    ratio = (found.residual + FIT.least) / (given.residual + FIT.least)
+    least = 1e-4  # 16 bits do not go below it
+    ratio = (found.residual + least) / (given.residual + least)
     power = POWERS[kind]
     if len(given.intensities) < _LEAST_LIGHTS["curve"]:
         power *= 0.6  # four or five lights
@@ -250,7 +225,7 @@ def _fit(
     *,
     offset: float = 0.0,
     free: bool = False,
-    shadow: float = FIT.shadow,
+    shadow: float = _SHADOW,
 ) -> _Fit:
     """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
 
@@ -265,7 +240,7 @@ def _fit(
         # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
         above = np.maximum(observed - offset / (offset + 0.8), 0)
         normals = fit_scaled_normals(above, start, lights)
-    for _ in range(FIT.offset_fits if offset else FIT.free_fits if free else FIT.fits):
+    for _ in range(14 if offset else 30 if free else 8):
         if offset:
             facing = (shade(normals, lights) > 0)[..., None]
             # Newton's step on |b|, halved: with much constant light, whole steps miss.
@@ -280,7 +255,7 @@ def _fit(
             intensities = _intensities(observed, predicted / intensities, weights, intensities)
     residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
     # The fits to few lights pass through most values. The median would be zero.
-    typical = np.median(residuals) if values.shape[1] >= FIT.for_median else residuals.mean()
+    typical = np.median(residuals) if values.shape[1] >= 8 else residuals.mean()
     return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
 
 
@@ -292,13 +267,5 @@ def _intensities(
     power = (weights * equal**2).sum(axis=0)
     found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
     found = np.clip(found / found.mean(), 0.05, 20)
-    intensities = before * (found / before) ** FIT.step
+    intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
     return np.asarray(intensities / intensities.mean())
-
-
-def _roundness(normals: Float64Array, places: Integers) -> float:
-    """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
-    across = unit(normals)[:, :2]
-    terms = np.concatenate((across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1)
-    missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
-    return float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))

@@ -29,6 +29,10 @@ class Sample:
 
 
 Part = tuple[slice, slice]  # rows and columns of the images
+# An image is dark if its 99 % quantile is below this share of the white level. A capture carries a warning with fewer
+# lights than these, or with all lights nearer than this angle to the camera axis.
+DARK, FEW_LIGHTS, NARROW_DEG = 0.05, 8, 30.0
+_ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
 
 
 def grid_of(mask: Bools) -> Part:
@@ -85,12 +89,6 @@ def leave_out_background(sample: Sample) -> tuple[Sample, float]:
     return Sample(sample.observations[inside.ravel()], inside, sample.step), float(1 - inside.mean())
 
 
-DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
-FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
-NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the camera axis carries a warning
-_ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
-
-
 @dataclass(frozen=True)
 class ImageSummary:
     """One image of a capture; only the mask's pixels are used."""
@@ -98,8 +96,7 @@ class ImageSummary:
     path: Path
     shape: tuple[int, ...]  # (H, W, C) as stored
     dtype: str  # as stored, such as "uint16"
-    # the 99 % quantile of the values, as a share of the white level. For floating-point images, the quantile itself
-    bright: float
+    bright: float  # the 99 % quantile of the values, as a share of the white level if they are integers
     saturated: float  # share of the pixels with a channel at the white level or above
 
 
@@ -146,10 +143,8 @@ class CaptureSummary:
             text = f"There are {len(self.images)} lights; use {FEW_LIGHTS} or more, well spread."
             found.append(CaptureWarning(codes.FEW_LIGHTS, text))
         if self.axis_angles_deg.max() < NARROW_DEG:
-            text = (
-                f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis; lower lights give better normals."
-            )
-            found.append(CaptureWarning(codes.LIGHTS_NEAR_AXIS, text))
+            text = f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis"
+            found.append(CaptureWarning(codes.LIGHTS_NEAR_AXIS, f"{text}; lower lights give better normals."))
         return found
 
     def _dark_images(self, dark: Sequence[ImageSummary]) -> CaptureWarning:
@@ -203,11 +198,14 @@ def summarise_capture(source: CaptureSource, progress: Progress = lambda: None) 
     if len(fitting) == len(sizes):
         sample, close = (sample_observations(observations, mask, part, taken) for part in parts)
         samples = sample, close
-    relative = tuple(_relative_to(level, images[index]) for index in range(len(sizes)))
+    for index, image in images.items():
+        full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
+        # The white level of 16-bit images does not apply to 8-bit images among them.
+        if level is not None and full_scale >= level.value:
+            images[index] = replace(image, bright=image.bright * (full_scale / level.value))
+    relative, lamps = tuple(images[index] for index in range(len(sizes))), source.near_lamps(mask)[1]
     of_mask = source.mask_warnings(mask, fitting)
-    return CaptureSummary(
-        source, relative, n_pixels, level, samples, source.near_lamps(mask)[1], of_mask, saturation.bits
-    )
+    return CaptureSummary(source, relative, n_pixels, level, samples, lamps, of_mask, saturation.bits)
 
 
 def _summarise(pixels: StoredPixels, size: tuple[int, ...]) -> ImageSummary:
@@ -219,12 +217,3 @@ def _summarise(pixels: StoredPixels, size: tuple[int, ...]) -> ImageSummary:
         stored = stored[np.random.default_rng(0).integers(len(stored), size=_ENOUGH)]
     bright = float(np.quantile(to_linear(stored, pixels.path), 0.99))
     return ImageSummary(pixels.path, (*size, stored.shape[1]), str(pixels.values.dtype), bright, 0.0)
-
-
-def _relative_to(level: WhiteLevel | None, image: ImageSummary) -> ImageSummary:
-    """Return the image with its brightness relative to the white level."""
-    full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
-    # The white level of 16-bit images does not apply to 8-bit images among them.
-    if level is None or full_scale < level.value:
-        return image
-    return replace(image, bright=image.bright * (full_scale / level.value))

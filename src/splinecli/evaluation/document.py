@@ -16,30 +16,11 @@ import numpy as np
 from splinecli import __version__
 from splinecli.documents import ComparisonReport, ProtocolReport
 from splinecli.errors import printable
+from splinecli.evaluation import protocol as protocol_module
+from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
-from splinecli.evaluation.protocol import (
-    EVERY_CAPTURE,
-    Evaluation,
-    Protocol,
-    all_captures,
-    all_skipped,
-    heading,
-    lights_in_words,
-    lights_value,
-)
-from splinecli.evaluation.tables import (
-    AVERAGE,
-    SIGNIFICANCE,
-    Comparison,
-    best_cells,
-    compare,
-    in_words,
-    latex,
-    markdown,
-    p_in_words,
-    table_rows,
-    trial_averages,
-)
+from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
+from splinecli.evaluation.tables import AVERAGE, Comparison, compare, table_rows
 from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
@@ -48,7 +29,6 @@ _MOST_SENTENCES = 3  # pairs, as with three methods; more pairs are easier to re
 _MINUS = "\N{MINUS SIGN}"
 _RESTORED = "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does"
 _AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
-
 Mark = Literal["", "star", "best"]
 
 
@@ -69,29 +49,29 @@ def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, 
     `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are sentences about the
     captures.
     """
-    first = evaluations[0]
+    first, captures = evaluations[0], _captures(evaluations)
     return render(
         "report.html",
-        title=f"{_count(len(first.methods), 'method')} on {_count(len(all_captures(evaluations)), 'capture')}",
+        title=f"{_count(len(first.methods), 'method')} on {_count(len(captures), 'capture')}",
         protocol=_protocol(evaluations),
         notes=notes,
-        skipped=[(s.capture, s.reason) for s in all_skipped(evaluations)],
+        skipped=[(s.capture, s.reason) for s in protocol_module.all_skipped(evaluations)],
         summary=_summary(evaluations) if len(evaluations) > 1 else None,
         several_methods=len(first.methods) > 1,
         sections=[_section(evaluation) for evaluation in evaluations],
         figures=[_figure(caption, png) for caption, png in figures],
-        significance=SIGNIFICANCE,
+        significance=tables.SIGNIFICANCE,
     )
 
 
 def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     first = evaluations[0].protocol
-    lights = dict.fromkeys(lights_in_words(e.protocol) for e in evaluations)
+    lights = dict.fromkeys(f"{lights_value(e.protocol)} lights" for e in evaluations)
     noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
     drawn = "at random from the seed" if first.draws_file is None else f"those of {first.draws_file.name}"
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
     left_out = ", ".join(
-        f"the first {count} of {'every other capture' if name == EVERY_CAPTURE else name}"
+        f"the first {count} of {'every other capture' if name == protocol_module.EVERY_CAPTURE else name}"
         for name, count in first.skip_first.items()
     )
     everything = "all that have ground truth"
@@ -104,7 +84,7 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     return [
         ("Methods", ", ".join(evaluations[0].methods)),
         *([("Weights", ", ".join(weights))] if weights else []),
-        ("Captures", ", ".join(all_captures(evaluations))),
+        ("Captures", ", ".join(_captures(evaluations))),
         ("Image values", _AS_STORED if first.as_stored else _RESTORED),
         ("Lights", ", ".join(lights)),
         ("Trials", " or ".join(map(str, trials))),
@@ -124,14 +104,14 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
         "heading": heading(evaluation.protocol),
         "errors": _error_table(evaluation),
         "seconds": _seconds_table(evaluation),
-        "sentences": [in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
+        "sentences": [tables.in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
         "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
         "pairs": [_pair_row(c) for c in comparisons],
     }
 
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
-    """Return a table of methods by evaluations, made from the last column of each evaluation's table."""
+    """Return a table of methods by evaluations, the last columns of their tables."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
         columns.append([Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])])
@@ -141,12 +121,12 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
 def _error_table(evaluation: Evaluation) -> Table:
     """Return a table of methods by captures and the average: MAE and its standard deviation over the trials."""
     header, *rows = table_rows(evaluation)
-    best = best_cells([header, *rows])
+    best = tables.best_cells([header, *rows])
     maes_deg = {(r.method, r.capture): r.maes_deg for r in evaluation.results}
     body = []
     for r, (method, *values) in enumerate(rows, start=1):
         trials = [maes_deg[method, capture] for capture in evaluation.captures]
-        trials.append(trial_averages(evaluation, method))
+        trials.append(tables.trial_averages(evaluation, method))
         cells = [
             Cell(value, f"± {np.std(maes):.2f}" if len(maes) > 1 else "", "best" if (r, c) in best else "")
             for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
@@ -156,7 +136,6 @@ def _error_table(evaluation: Evaluation) -> Table:
 
 
 def _seconds_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures: seconds per trial."""
     seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
     body = [
         [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
@@ -169,12 +148,9 @@ def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
     """Return a table of MAE differences, row method minus column method; significant ones are marked."""
     cells = {}
     for c in comparisons:
-        for row, column, difference_deg in (
-            (c.first, c.second, c.difference_deg),
-            (c.second, c.first, -c.difference_deg),
-        ):
-            mark: Mark = "" if not c.differs else "best" if difference_deg < 0 else "star"
-            cells[row, column] = Cell(_signed(difference_deg), mark=mark)
+        for row, column, difference in ((c.first, c.second, c.difference_deg), (c.second, c.first, -c.difference_deg)):
+            mark: Mark = "" if not c.differs else "best" if difference < 0 else "star"
+            cells[row, column] = Cell(_signed(difference), mark=mark)
     body = [[Cell(row), *(cells.get((row, column), Cell("")) for column in methods)] for row in methods]
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
@@ -184,7 +160,7 @@ def _pair_row(c: Comparison) -> dict[str, str]:
         interval = p_value = "not tested"
     else:
         interval = " to ".join(map(_signed, c.interval_deg))
-        p_value = p_in_words(c.p_holm)
+        p_value = tables.p_in_words(c.p_holm)
     verdict = {None: "", True: f"{c.first if c.difference_deg < 0 else c.second} is better", False: "no"}
     return {
         "capture": c.capture,
@@ -205,14 +181,15 @@ def _signed(value_deg: float) -> str:
     return f"{value_deg:+.2f}".replace("-", _MINUS)
 
 
+def _captures(evaluations: Sequence[Evaluation]) -> list[str]:
+    return list(dict.fromkeys(capture for e in evaluations for capture in e.captures))
+
+
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 _DIGITS = 4  # decimal places of degrees and seconds
-_P_DIGITS = 3  # significant digits, because p-values span many orders of magnitude
-_FORMULA = ("=", "+", "-", "@")
-
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 
 
@@ -239,8 +216,8 @@ def write_results(
     shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
     texts = {
         "results.csv": results_csv(evaluations),
-        "table.md": markdown(evaluations),
-        "table.tex": latex(evaluations),
+        "table.md": tables.markdown(evaluations),
+        "table.tex": tables.latex(evaluations),
         REPORT: html_report(evaluations, shown, document["notes"]),
         RESULTS: json.dumps(document, indent=2) + "\n",
     }
@@ -274,7 +251,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         ],
         "averages": _averages(evaluations),
         "comparisons": [record for evaluation in evaluations for record in _comparisons(evaluation)],
-        "skipped": [{"capture": s.capture, "reason": s.reason} for s in all_skipped(evaluations)],
+        "skipped": [{"capture": s.capture, "reason": s.reason} for s in protocol_module.all_skipped(evaluations)],
         "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)),
         "version": __version__,
     }
@@ -317,7 +294,7 @@ def _as_text_cell(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     text = printable(value)
-    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
+    return f"'{text}" if text.lstrip().startswith(("=", "+", "-", "@")) else text
 
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
@@ -374,7 +351,8 @@ def _rounded(value: float | None) -> float | None:
 
 
 def _significant(p_value: float | None) -> float | None:
-    return None if p_value is None else float(f"{p_value:.{_P_DIGITS}g}")
+    # Three significant digits, because p-values span many orders of magnitude
+    return None if p_value is None else float(f"{p_value:.3g}")
 
 
 def _one_or_list(values: Sequence[Any]) -> Any:

@@ -1,8 +1,6 @@
 """Figures of evaluations: the error against a setting, and maps and observation maps of single captures.
 
-The error is plotted against the setting that differs between the evaluations: the number of lights or the light noise.
-All functions take several evaluations of the same methods. They plot only the captures that all evaluations scored, so
-that every point of an average covers the same captures.
+Curves show only the captures that all evaluations scored, so that every point of an average covers the same captures.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError, printable
-from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_in_words
+from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.run import draws_for, read_draws_file
 from splinecli.evaluation.tables import AVERAGE, trial_averages
 from splinecli.evaluation.trials import Trial, TrialSource
@@ -31,10 +29,7 @@ from splinecli.system.files import free_name
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
-MOST_CAPTURES = 4
-"""Largest number of captures with a panel each. With more, only the average is plotted, to keep the figure legible."""
-
+MOST_CAPTURES = 4  # with a panel each. With more, only the average is plotted, to keep the figure legible
 _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
@@ -67,7 +62,7 @@ def light_noise_curves(evaluations: Sequence[Evaluation]) -> bytes:
         evaluations,
         x=lambda e, _: e.protocol.light_noise_deg,
         tick=lambda _, x: f"{x:g}",
-        series=lambda e: lights_in_words(e.protocol),
+        series=lambda e: f"{lights_value(e.protocol)} lights",
         label="light noise (standard deviation, deg)",
         logarithmic=False,
     )
@@ -160,9 +155,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-SHOWN_PERCENTILES = (10, 50, 90, 99)
-"""Percentiles of SPLINE-Net's errors at which pixels are shown by default."""
-
+SHOWN_PERCENTILES = (10, 50, 90, 99)  # of SPLINE-Net's errors, at which pixels are shown by default
 MAPS = "_observation_maps"
 
 
@@ -185,15 +178,10 @@ def capture_figures(
 ) -> list[CaptureFigure]:
     """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one of single pixels.
 
-    The figure of single pixels is omitted under near lamps or with a camera matrix. All pixels in the mask are
-    estimated, even if the protocol has max_pixels. Raises InputError if the capture cannot be read or scored, or
-    UsageError if a pixel has no ground truth.
-
-    Args:
-        name: name of the capture in the tables.
-        stem: stem of the figures' file names.
-        pixels: (row, column) of the pixels whose observation maps are shown; if empty, pixels at SHOWN_PERCENTILES.
-        advance: called with the fraction of the work just completed.
+    The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near lamps or with a
+    camera matrix. All pixels in the mask are estimated, even if the protocol has max_pixels. `name` is the capture's in
+    the tables, and `stem` that of the files. `advance` is called with the fraction of the work just completed. Raises
+    InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)
@@ -216,7 +204,7 @@ def capture_figures(
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
-    network = next((each for each in estimators if has_observation_maps(each.name)), None)
+    network = next((e for e in estimators if e.name in METHODS and METHODS[e.name].observation_maps), None)
     # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
@@ -224,11 +212,6 @@ def capture_figures(
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
         figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
-
-
-def has_observation_maps(method: str) -> bool:
-    """Return whether a method uses observation maps, so that figures can show them."""
-    return method in METHODS and METHODS[method].observation_maps
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -255,10 +238,9 @@ def _observation_maps(
     for row, column in pixels:
         inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
         if not inside or np.isnan(errors_deg[row, column]):
-            raise UsageError(
-                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
-                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
-            )
+            problem = f"the pixel in row {row}, column {column} of {capture.name} has no ground truth"
+            hint = "Name pixels on the object, rows from the top and columns from the left, from 0"
+            raise UsageError(problem, hint=hint)
     rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
     if not pixels:
         order = np.argsort(errors_deg[rows, columns], kind="stable")

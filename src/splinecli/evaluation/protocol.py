@@ -15,12 +15,7 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
-
-DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
-"""First elements of the seeds, so that draws, light noise and the choice of pixels are independent."""
-
-_REDRAWS = 1000
-_INDEX = re.compile(r"[0-9]{1,9}")
+DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3  # of the seeds: draws, noise and choice of pixels are independent
 
 
 def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
@@ -28,21 +23,15 @@ def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials:
 
     Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the same number of lights
     get the same draws, and additional trials extend the same list. A draw is repeated only if its lights are coplanar,
-    because no method can solve it. All lights together form one draw, regardless of the number of trials.
+    because no method can solve it. All lights together, or `n_lights` of None, form one draw.
 
-    Args:
-        light_directions: (F, 3) unit.
-        n_lights: the number of lights in a draw; None for all lights.
-
-    Raises:
-        UsageError: fewer than three lights, more than available, no trials, or a negative seed.
-        InputError: in every draw, the lights were coplanar.
+    Raises UsageError for settings that are out of range, or InputError if the lights of every draw were coplanar.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        problem = f"{n_lights} lights were requested, but the capture has {available}"
-        raise UsageError(problem, hint=f"Ask for at most {available} lights")
+        hint = f"Ask for at most {available} lights"
+        raise UsageError(f"{n_lights} lights were requested, but the capture has {available}", hint=hint)
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -109,24 +98,24 @@ def read_draws(path: Path) -> DrawsFile:
 
 def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
-    for _ in range(_REDRAWS):
+    for _ in range(1000):
         # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the same in later NumPy
         # versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    problem = f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws"
+    problem = f"found no {n_lights} lights that do not lie in one plane in 1000 draws"
     raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
 
 
 def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     for word in words:
-        if _INDEX.fullmatch(word) is None:
+        if re.fullmatch("[0-9]{1,9}", word) is None:
             raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
     draw = tuple(map(int, words))
     for position, index in enumerate(draw):
         if index in draw[:position]:
-            raise InputError(f"light index {index} comes twice", path=path, line=line, hint="Name each light once")
+            raise InputError(f"light index {index} is listed twice", path=path, line=line, hint="Name each light once")
     if len(draw) < MIN_LIGHTS:
         raise InputError(f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line)
     if len(draw) != n_lights:
@@ -136,7 +125,6 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
 
 
 EVERY_CAPTURE = "*"  # key in `skip_first` for all captures without their own key
-LARGEST_SIGMA_DEG = 30.0  # largest standard deviation of the light noise that an evaluation accepts
 
 
 @dataclass(frozen=True)
@@ -146,29 +134,22 @@ class Protocol:
     Raises UsageError if a value is out of its range.
     """
 
-    # in each draw. None means all lights of a capture. A draws file overrides this field and trials.
-    n_lights: int | None = None
+    n_lights: int | None = None  # in each draw; None for all. A draws file overrides this field and trials
     trials: int = 1  # the number of random draws. Without light noise, a draw of all lights needs only one trial.
     seed: int = 0  # for the draws, the light noise and the choice of pixels
     draws_file: Path | None = None  # file that provides the draws instead; see read_draws
     light_noise_deg: float = 0.0  # standard deviation of the angle by which each trial tilts the light directions
-    # number of randomly chosen pixels to score in each capture. None scores all pixels that have ground truth.
-    max_pixels: int | None = None
-    # number of images to skip at the start, by the name of the capture; EVERY_CAPTURE for all others
-    skip_first: Mapping[str, int] = field(default_factory=dict)
-    # score the stored values only, as the published tables do. By default, saturated observations are restored and
-    # unknown light intensities are estimated, as in `infer`.
-    as_stored: bool = False
+    max_pixels: int | None = None  # to score in each capture, chosen at random; None for all with ground truth
+    skip_first: Mapping[str, int] = field(default_factory=dict)  # images, by the name of the capture or EVERY_CAPTURE
+    as_stored: bool = False  # whether the stored values are scored, as in published tables, or read as in `infer`
     white_level: float | None = None
-    # typical error of the light directions, with which each trial refines them (see refine_capture). None disables the
-    # refinement.
-    light_error_deg: float | None = None
+    light_error_deg: float | None = None  # typical error with which trials refine the lights (see refine_capture)
     finds_lights: bool = False  # whether trials estimate their lights from the images, as `infer --lights estimate`
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
-        if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
-            raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
+        if not 0 <= self.light_noise_deg <= 30.0:
+            raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to 30")
 
     def skipped_lights(self, capture: str) -> int:
         """Return the number of lights that are skipped at the start of a capture."""
@@ -176,19 +157,13 @@ class Protocol:
 
 
 def lights_value(protocol: Protocol) -> int | Literal["all"]:
-    """Return the number of lights in each draw, or "all"."""
     return "all" if protocol.n_lights is None else protocol.n_lights
-
-
-def lights_in_words(protocol: Protocol) -> str:
-    """Return the number of lights in a draw as text: "10 lights", "all lights"."""
-    return f"{lights_value(protocol)} lights"
 
 
 def heading(protocol: Protocol) -> str:
     """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
     noise = f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
-    return lights_in_words(protocol) + noise
+    return f"{lights_value(protocol)} lights{noise}"
 
 
 def protocol_in_words(protocol: Protocol) -> str:
@@ -222,12 +197,10 @@ class Result:
     n_lights: int  # number of lights in each draw
     maes_deg: tuple[float, ...]  # mean angular error (MAE) over the scored pixels, in degrees, of each trial
     seconds: float  # mean time to estimate the normals in a trial
-    # mean error of the light directions estimated by the trials; None if they were not estimated
-    found_light_error_deg: float | None = None
+    found_light_error_deg: float | None = None  # mean error of light directions that the trials estimated
 
     @property
     def trials(self) -> int:
-        """Number of trials."""
         return len(self.maes_deg)
 
     @property
@@ -257,17 +230,15 @@ class Evaluation:
     results: tuple[Result, ...]  # one per capture and method, ordered by capture as given, then by method
     skipped: tuple[Skipped, ...] = ()  # the captures that could not be scored
     notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
-    # {"weights", "device", "precision", "fingerprint"} of each method by name; see Estimator
+    # "weights", "device", "precision" and "fingerprint" of each method by name; see Estimator
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods, without duplicates."""
         return tuple(dict.fromkeys(result.method for result in self.results))
 
     @property
     def captures(self) -> tuple[str, ...]:
-        """Names of the scored captures, without duplicates."""
         return tuple(dict.fromkeys(result.capture for result in self.results))
 
     @property
@@ -277,11 +248,6 @@ class Evaluation:
             method: math.fsum(r.mae_deg for r in self.results if r.method == method) / len(self.captures)
             for method in self.methods
         }
-
-
-def all_captures(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Return the names of the captures scored by any of the evaluations, without duplicates."""
-    return list(dict.fromkeys(capture for e in evaluations for capture in e.captures))
 
 
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[Skipped]:

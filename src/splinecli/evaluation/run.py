@@ -18,17 +18,8 @@ from splinecli.capture import CaptureSource, capture_name
 from splinecli.capture.files import digest
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.protocol import (
-    EVERY_CAPTURE,
-    Draw,
-    DrawsFile,
-    Evaluation,
-    Protocol,
-    Result,
-    Skipped,
-    draw_lights,
-    read_draws,
-)
+from splinecli.evaluation import protocol as protocol_module
+from splinecli.evaluation.protocol import Draw, DrawsFile, Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.tables import AVERAGE
 from splinecli.evaluation.trials import CaptureReading, Notes, Score, SharedDraw, Trial, TrialStore, open_to_score
 from splinecli.lights.light_fit import check_distant
@@ -54,17 +45,23 @@ class ProtocolTrials:
         self, captures: Sequence[str], store: TrialStore, settings: Mapping[str, Mapping[str, Any]]
     ) -> Evaluation:
         """Return the outcome, in the order of the captures. Raises an error if all captures failed."""
-        results, n_estimated = [], {}
+        results, n_estimated, light_errors_deg = [], {}, {}
         for (capture, method), trials in self.trials.items():
             scores = [score for trial in trials if (score := store.find(trial)) is not None]
             seconds = math.fsum(score.seconds for score in scores) / len(scores)
             maes_deg = tuple(score.mae_deg for score in scores)
             found = [s.found_light_error_deg for s in scores if s.found_light_error_deg is not None]
-            light_error_deg = math.fsum(found) / len(found) if found else None
-            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_error_deg))
+            light_errors_deg[capture] = math.fsum(found) / len(found) if found else None
+            result = Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_errors_deg[capture])
+            results.append(result)
             n_estimated[capture] = (sum(score.estimated_intensities for score in scores), len(scores))
         if not results:
-            raise _nothing_scored([self.failures[name] for name in captures])
+            failures = [self.failures[name] for name in captures]
+            if len(failures) == 1:
+                raise failures[0]
+            kind = UsageError if all(isinstance(failure, UsageError) for failure in failures) else InputError
+            first = str(failures[0]).removesuffix(".")
+            raise kind(f"none of the {len(failures)} captures could be scored; the first: {first}")
         skipped = (Skipped(name, str(self.failures[name])) for name in captures if name in self.failures)
         notes = [note for name in captures for note in self.notes.get(name, ())]
         notes += [
@@ -74,7 +71,7 @@ class ProtocolTrials:
         ]
         notes += [
             f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on average."
-            for name, error_deg in {r.capture: r.found_light_error_deg for r in results}.items()
+            for name, error_deg in light_errors_deg.items()
             if error_deg is not None
         ]
         return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes), settings)
@@ -90,12 +87,10 @@ class CaptureJob:
     draws: list[list[Trial]]
 
     def fail(self, error: SplinecliError) -> None:
-        """Record why the capture cannot be scored."""
         for task in self.tasks:
             task.fail(self.reading.name, error)
 
     def note(self, notes: Notes) -> None:
-        """Record the notes on the capture."""
         for task, of_protocol in zip(self.tasks, notes, strict=True):
             task.notes[self.reading.name] = of_protocol
 
@@ -146,22 +141,15 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     """Return the protocol, with n_lights and trials taken from its draws file, and the draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
-    draws_file = read_draws(protocol.draws_file)
+    draws_file = protocol_module.read_draws(protocol.draws_file)
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 
 def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
-    """Return the draws of a capture, one for each trial.
-
-    Raises InputError if the capture has no ground truth, or a draw in the file does not fit it, or UsageError if it has
-    too few lights, or if the protocol would refine near lamps.
-    """
+    """Return the draws of a capture, one for each trial. Raises InputError or UsageError if it does not fit."""
     if source.files.ground_truth is None:  # known before the images are read
-        raise InputError(
-            "the capture has no ground truth",
-            path=source.files.folder,
-            hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
-        )
+        hint = "Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat"
+        raise InputError("the capture has no ground truth", path=source.files.folder, hint=hint)
     near = source.lamps is not None and source.lamps.used
     if protocol.light_error_deg is not None:
         check_distant("--refine-lights", "refines", near=near)
@@ -171,26 +159,22 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
     left = source.n_lights - skipped
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)
     if skipped and left < fewest:
-        raise UsageError(
-            f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}, expected at least"
-            f" {fewest}"
-        )
+        found = f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}"
+        raise UsageError(f"{found}, expected at least {fewest}")
     if draws_file is not None:
         draws_file.check_against(source.light_directions, skipped=skipped)
         return list(draws_file.draws)
-    draws = draw_lights(
-        source.light_directions[skipped:], protocol.n_lights, trials=protocol.trials, seed=protocol.seed
-    )
+    directions, trials = source.light_directions[skipped:], protocol.trials
+    draws = protocol_module.draw_lights(directions, protocol.n_lights, trials=trials, seed=protocol.seed)
     draws = [tuple(light + skipped for light in draw) for draw in draws]
     # All lights form one draw, but their noise differs from trial to trial.
-    return draws * protocol.trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
+    return draws * trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
 
 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     """Return the folders, without duplicates, with the names of the captures.
 
-    If two names are equal, all captures are named by the last parts of their paths. The name of the average in the
-    tables is never used for a capture.
+    If two names are equal, or one is that of the average in the tables, all are the last parts of their paths.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
@@ -204,14 +188,6 @@ def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     return dict(zip(folders, names, strict=True))
 
 
-def _nothing_scored(failures: list[SplinecliError]) -> SplinecliError:
-    if len(failures) == 1:
-        return failures[0]
-    kind = UsageError if all(isinstance(failure, UsageError) for failure in failures) else InputError
-    first = str(failures[0]).removesuffix(".")
-    return kind(f"none of the {len(failures)} captures could be scored; the first: {first}")
-
-
 class DrawTask(NamedTuple):
     """One draw of a capture: its trials, and the data read for all draws. Without trials, only notes are returned."""
 
@@ -219,14 +195,12 @@ class DrawTask(NamedTuple):
     trials: Sequence[Trial]
 
 
+# The score of each trial of a draw and the notes on its capture, or the reason that the capture cannot be scored
 Scored = tuple[Sequence[Score], Notes] | SplinecliError
-"""The score of each trial of a draw and the notes on its capture, or the reason that the capture cannot be scored."""
-
+# Scores draws in other processes, and yields each draw with its scores as it finishes
 Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
-"""Scores draws in other processes, and yields each draw with its scores as it finishes."""
-
+# Called with the fraction of all trials just completed, weighted by their pixels, and a short text
 OnProgress = Callable[[float, str], object]
-"""Called with the fraction of all trials just completed, weighted by their pixels, and a short text."""
 
 
 def evaluate_all(
@@ -241,9 +215,8 @@ def evaluate_all(
 ) -> list[Evaluation]:
     """Score every estimator on every capture under every protocol. None may be empty, and names must be unique.
 
-    Captures are named by capture_name or, if two names are equal, by the last parts of their paths. Duplicate folders
-    are ignored. A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome
-    contains the reason.
+    A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome contains the
+    reason. See distinct_names for the names of captures.
 
     Args:
         store: where finished trials are stored; trials in the store are not computed again.
@@ -253,8 +226,7 @@ def evaluate_all(
 
     Raises:
         UsageError: skip_first names a capture that does not exist.
-        InputError: the draws file is invalid, or no capture could be scored. With a single capture, its own error is
-            raised, which may also be a UsageError.
+        InputError: the draws file is invalid, or no capture could be scored; a single capture's own error is raised.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
@@ -262,7 +234,7 @@ def evaluate_all(
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
-        for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
+        for name in set(protocol.skip_first) - {protocol_module.EVERY_CAPTURE, *names}:
             raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
     store = TrialStore() if store is None else store
     planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]
@@ -336,9 +308,7 @@ class _Progress:
     """Counts trials across all threads."""
 
     def __init__(self, total: int, advance: OnProgress) -> None:
-        self._total, self._advance = total, advance
-        self._lock = Lock()
-        self._finished = 0
+        self._total, self._advance, self._lock, self._finished = total, advance, Lock(), 0
 
     def read_image(self, capture: str, n_read: int, n_images: int) -> None:
         with self._lock:

@@ -22,18 +22,15 @@ from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ
-
-# Error maps are float32, so MAEs closer than this are considered equal.
-_SAME_DEG = 1e-6
+_SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are considered equal
 
 
 @dataclass(frozen=True)
 class Comparison:
     """The difference of two methods on one capture, or on the average over the captures, trial by trial.
 
-    With one trial, or if the differences of all trials are equal but not zero (the same trial repeated), no test is
-    possible, and interval_deg, p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p
-    is 1. Differences within 1e-6 degrees, the precision of the error maps, are considered equal.
+    With one trial, or if the differences of all trials are equal but not zero, no test is possible, and interval_deg,
+    p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p is 1.
     """
 
     capture: str  # name of the capture, or AVERAGE
@@ -43,8 +40,7 @@ class Comparison:
     # mean over the trials of MAE(`first`) - MAE(`second`); `first` is better below 0
     difference_deg: float
     std_deg: float  # population standard deviation of the differences
-    # 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0 while p_holm is
-    # above SIGNIFICANCE.
+    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
     interval_deg: tuple[float, float] | None
     p_value: float | None
     p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
@@ -140,16 +136,10 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 _MOST_WIDE = 6  # captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
 _LATEX = str.maketrans(
-    {
-        **{character: f"\\{character}" for character in "&%$#_{}"},
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        # In TeX's oldest font encoding, which is still the default, these codes are other characters.
-        "<": r"\textless{}",
-        ">": r"\textgreater{}",
-        "|": r"\textbar{}",
-    }
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    # In TeX's oldest font encoding, which is still the default, these codes are other characters.
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 )
 
 
@@ -203,7 +193,6 @@ def latex(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """Return the text on one line, escaped so that Markdown shows it unchanged."""
     return re.sub(r"([\\`*<>|\[\]&~])", r"\\\1", " ".join(text.split()))
 
 

@@ -45,20 +45,9 @@ class Trial:
     @property
     def record(self) -> dict[str, Any]:
         """The trial as JSON values."""
-        p = self.protocol
-        return {
-            "capture": self.capture,
-            "method": self.method,
-            "number": self.number,
-            "lights": self.lights,
-            "light_noise_deg": p.light_noise_deg,
-            "seed": p.seed,
-            "max_pixels": p.max_pixels,
-            "as_stored": p.as_stored,
-            "made_of": self.made_of,
-            "light_error_deg": p.light_error_deg,
-            "finds_lights": p.finds_lights,
-        }
+        names = ("capture", "method", "number", "lights", "light_noise_deg", "seed", "max_pixels", "as_stored")
+        values = vars(self) | vars(self.protocol)
+        return {name: values[name] for name in (*names, "made_of", "light_error_deg", "finds_lights")}
 
     @property
     def key(self) -> str:
@@ -83,8 +72,7 @@ class Score:
     mae_deg: float  # mean angular error over the scored pixels
     seconds: float  # time spent on estimating their normals
     estimated_intensities: bool  # whether the light intensities were estimated from the images
-    # mean error of the light directions estimated from the images; None if they were not estimated
-    found_light_error_deg: float | None = None
+    found_light_error_deg: float | None = None  # mean error of light directions that were estimated from the images
 
 
 class TrialStore:
@@ -128,7 +116,6 @@ class TrialStore:
 
 
 def _read_line(line: str) -> tuple[str, Score] | None:
-    """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
         key, score = record["key"], Score(**{field.name: record.get(field.name) for field in fields(Score)})
@@ -139,11 +126,9 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
 
 
-_LARGEST_TILT_DEG = 89.0
 OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
-DAMAGED_IMAGES = {"bearPNG": 20}
-"""The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
+DAMAGED_IMAGES = {"bearPNG": 20}  # the first 20 of DiLiGenT's Bear are corrupted, as users of the benchmark reported
 
 
 @dataclass(frozen=True)
@@ -151,9 +136,7 @@ class TrialSource:
     """A capture that was read once, from which each trial takes its lights.
 
     Every draw is restored separately: a saturated observation is restored from the other lights of the draw, as
-    `infer` does when it reads only these lights.
-
-    `rows` are the rows of the observations to score; None for all rows.
+    `infer` does when it reads only these lights. `rows` are the rows of the observations to score; None for all rows.
     """
 
     stored: StoredCapture
@@ -243,7 +226,7 @@ def tilt_lights(
     opposite way and stays above it, so that all directions are valid for a capture.
     """
     n_lights = len(light_directions)
-    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
+    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-89.0, 89.0))
     # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
     across = generator.normal(size=(n_lights, 3))
     along = np.einsum("fi,fi->f", across, light_directions)
@@ -298,7 +281,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
     if skipped:
-        notes.append(f"{name}: the first {skipped} images are left out.")
+        notes.append(f"{name}: the first {skipped} images were left out.")
     elif damaged:
         notes.append(
             f"{name}: the first {damaged} images are known to be damaged and are used;"

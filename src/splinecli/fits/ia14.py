@@ -1,7 +1,6 @@
 """IA14: the inverse of image formation, with n.l as a monotone polynomial of the observation and of l.v.
 
-Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic surfaces, CVPR
-2014.
+Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic surfaces, CVPR 2014.
 """
 
 from math import comb
@@ -11,9 +10,7 @@ from torch import Tensor
 
 from splinecli.fits.least_squares import lit_observations
 
-DEGREE_OBSERVATION = 2  # N1 in the paper
-DEGREE_LIGHT = 4  # N2 in the paper
-SHADOW_SHARE = 0.2  # of the pixel's quantile UNSHADED; observations below it are left out as shadows
+DEGREE_OBSERVATION, DEGREE_LIGHT = 2, 4  # N1 and N2 in the paper
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
@@ -40,18 +37,16 @@ def fit(
 
     The prior is not from the paper. Ten lights do not determine the 13 unknowns. Among all g that fit, the prior
     selects the one nearest to Lambert's law, for which all increments are equal. With 96 lights it hardly matters. The
-    condition on the mean of g and the scale of the threshold are not from the paper either.
+    condition on the mean of g and the scale of the threshold are not from the paper either. A variance of 1 costs as
+    much as a residual of sqrt(prior_weight) times the mean shading.
 
-    Args:
-        observations: (P, F), the largest of a pixel at most 1.
-        light_directions: (F, 3) or (P, F, 3), unit length, z to the camera.
-        valid: (P, F) bool. None means all are valid.
-        prior_weight: a variance of 1 costs as much as a residual of sqrt(prior_weight) times the mean shading.
+    The observations (P, F) are at most 1, under unit light directions (F, 3) or (P, F, 3); `valid` (P, F) is true by
+    default.
     """
     intensities, lights = observations.double(), light_directions.double()
     if valid is not None:
         intensities = torch.where(valid, intensities, 0)
-    used = lit_observations(intensities, SHADOW_SHARE, valid) & (intensities > 0)
+    used = lit_observations(intensities, 0.2, valid) & (intensities > 0)
     intensities = torch.where(used, intensities, 0)
     directions = torch.where(used[..., None], lights, 0)
     basis = _increment_basis(intensities, lights[..., 2])
@@ -96,17 +91,12 @@ def _bernstein(values: Tensor, degree: int) -> Tensor:
 
 
 def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
-    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for P programmes with a hessian H and a linear term q
-    each.
+    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for positive definite hessians H (P, K, K) and q (P, K).
 
     Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM J. Sci. Comput.,
     algorithm 2): guess which variables are free, solve for them with the others at zero, and exchange those that
     violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum. They may cause cycles
     if a hessian is nearly singular; the result is then feasible and close to the optimum.
-
-    Args:
-        hessian: (P, K, K), symmetric and positive definite.
-        linear: (P, K).
     """
     count, size = linear.shape
     eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)

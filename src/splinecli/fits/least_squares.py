@@ -24,24 +24,16 @@ from torch import Tensor
 from splinecli.fits.robust import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
 from splinecli.maths.observation_map import dot
 
+# The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
+# observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
+# a metal all others are dark compared with the highlight.
 UNSHADED = 0.6
-"""The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
-observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
-a metal all others are dark compared with the highlight."""
-
-FEWEST_LIT = 3  # number of brightest observations never treated as shadows, because a normal needs three
 
 
-def lit_observations(
-    observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = FEWEST_LIT
-) -> Tensor:
-    """Return which observations (P, F) reach `share` of the pixel's quantile UNSHADED or are among its `fewest`
-    largest.
+def lit_observations(observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = 3) -> Tensor:
+    """Return which observations (P, F), 0 or more, are lit: `share` of the pixel's quantile UNSHADED, or more.
 
-    Args:
-        observations: (P, F), not negative.
-        share: the threshold; 0 takes all observations.
-        valid: (P, F) bool; false ones are not lit. None means all are valid.
+    The `fewest` largest are always lit, because a normal needs three. Those that are not valid (P, F) never are.
     """
     if not len(observations):  # an empty batch has no quantile
         return observations.bool()
@@ -55,20 +47,12 @@ def lit_observations(
 
 RIDGE = 1e-12  # Weight of |b|^2. It matters only if the lights of positive weight are coplanar.
 
-_TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
-
 
 def weighted_least_squares(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return b = C L' W I with C = (L' W L + ridge)^-1, and the diagonal of L C L', which are the variances of L b.
+    """Return b = C L' W I (P, 3), C = (L' W L + ridge)^-1, and the diagonal of L C L' (P, F), the variances of L b.
 
-    All arguments are float64, because weights may differ by many orders of magnitude.
-
-    Args:
-        observations, weight: (P, F).
-        light_directions: (F, 3) or (P, F, 3).
-
-    Returns:
-        b (P, 3) and variances (P, F).
+    Observations and weights are (P, F), and light directions (F, 3) or (P, F, 3). All are float64, because weights may
+    differ by many orders of magnitude.
     """
     x, y, z = light_directions.unbind(-1)
     products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
@@ -76,7 +60,7 @@ def weighted_least_squares(observations: Tensor, light_directions: Tensor, weigh
     covariance = inverse_3x3((weighted_sum(weight, products) + ridge).unbind(-1), RIDGE)
     right_side = weighted_sum(weight * observations, light_directions)
     scaled_normals = torch.stack(multiply_symmetric(covariance, right_side.unbind(-1)), dim=-1)
-    variances = dot(torch.stack(covariance, dim=-1), products * products.new_tensor(_TWICE_OFF_DIAGONAL))
+    variances = dot(torch.stack(covariance, dim=-1), products * products.new_tensor((1.0, 1.0, 1.0, 2.0, 2.0, 2.0)))
     return scaled_normals, variances
 
 
@@ -94,10 +78,8 @@ _PRIOR = 1e-4
 def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return scaled normals b (P, 3) of the robust Lambertian fit: |b| is the albedo, b / |b| the normal.
 
-    Args:
-        observations: (P, F), each pixel scaled to a largest value of 1. A zero pixel gives b = (0, 0, tiny).
-        light_directions: (F, 3) or (P, F, 3), unit.
-        valid: (P, F) bool, all by default.
+    Each pixel's observations (P, F) are scaled to a largest value of 1. A zero pixel gives b = (0, 0, tiny). The light
+    directions (F, 3) or (P, F, 3) are unit; all observations are valid (P, F) by default.
     """
     # A row for each light: sums over lights and the steps below then run along the pixels, three times as fast.
     observed = observations.T.contiguous()
@@ -147,10 +129,9 @@ class TwoHalves(NamedTuple):
 def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
     """Fit all lights, and compare two halves of them.
 
-    Args:
-        observations: (P, F) float64, each pixel scaled to a largest value of 1.
-        light_directions: (F, 3) or (P, F, 3) float64, unit.
-        signs: (F,), 1 and -1 for the two halves, the same for all pixels of a capture; see alternating_signs.
+    The observations (P, F) of each pixel are scaled to a largest value of 1, and the light directions (F, 3) or
+    (P, F, 3) are unit, all in float64. The signs (F,) are 1 and -1 for the two halves, the same for all pixels of a
+    capture; see alternating_signs.
     """
     gram = light_directions.mT @ light_directions
     covariance = torch.linalg.inv(gram + RIDGE * torch.eye(3, dtype=gram.dtype, device=gram.device))
@@ -185,11 +166,8 @@ def alternating_signs(light_directions: Tensor) -> Tensor:
     return 1 - 2 * (place % 2).to(light_directions)
 
 
+# Trimmed LS and IW12 leave out observations below this share of the pixel's quantile UNSHADED, as IW12's authors do.
 SHADOW_SHARE = 0.1
-"""Share of the pixel's quantile UNSHADED. Trimmed LS and IW12 leave darker observations out as shadows, as the authors
-of IW12 do."""
-
-FEWEST = 4  # smallest number of observations that stay: one more than a normal and an albedo need
 
 
 def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
@@ -198,9 +176,9 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
     Equal observations are kept or left out together, so the order of the lights does not matter.
     """
     count = observations.shape[1]
-    # Share of the observations that is left out at each end: with ten lights, the two darkest and the two
-    # brightest.
-    trimmed = max(0, min(int(0.2 * count), (count - FEWEST) // 2))
+    # A fifth is left out at each end: with ten lights, the two darkest and the two brightest. At least four stay, one
+    # more than a normal and an albedo need.
+    trimmed = max(0, min(int(0.2 * count), (count - 4) // 2))
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
     middling = (observations >= darkest) & (observations <= brightest)
@@ -231,12 +209,8 @@ def _fit(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tupl
     return scaled_normals, (observations - dot(scaled_normals, light_directions)).abs()
 
 
+# Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best.
 SMALLEST_VARIANCE = 1e-6
-"""Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best."""
-
-IW12_ROUNDS = (
-    20  # further iterations change the normals of real captures by only some hundredths of a degree on average
-)
 
 
 def solve_iw12(
@@ -245,7 +219,7 @@ def solve_iw12(
     valid: Tensor | None = None,
     *,
     shadow_share: float = SHADOW_SHARE,
-    iterations: int = IW12_ROUNDS,
+    iterations: int = 20,
 ) -> Tensor:
     """Return scaled normals b (P, 3) of I = L b + e with sparse e: each error has its own variance gamma.
 
@@ -255,13 +229,11 @@ def solve_iw12(
 
     The constants require a fixed scale: the largest observation of a pixel is 1, so bright and dark pixels are treated
     alike. Variances start at 1, so the first step is least squares. sigma is 1e-6 (eq. 12), the ridge of
-    weighted_least_squares.
+    weighted_least_squares. Further iterations change the normals of real captures by only some hundredths of a degree
+    on average.
 
-    Args:
-        observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) or (P, F, 3) float64, unit.
-        valid: (P, F) bool. None means all are valid.
-        shadow_share: see lit_observations. 0 keeps all observations.
+    The observations (P, F), the largest of each pixel 1, and the unit light directions (F, 3) or (P, F, 3) are float64.
+    See lit_observations for `valid` and `shadow_share`; 0 keeps all observations.
     """
     lit = lit_observations(observations, shadow_share, valid).to(observations.dtype)
     variance = torch.ones_like(observations)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths import Float64Array, Floats
 
-SMALLEST_PIVOT = 1e-12
-"""A usual limit of the pivots if the lights are unit vectors and the largest weight is about 1."""
+SMALLEST_PIVOT = 1e-12  # usual limit of pivots if the lights are unit vectors and the largest weight is about 1
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
@@ -57,8 +56,6 @@ def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> N
 
 
 SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one are treated as shadow
-_PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
-_EQUAL_WEIGHT_BELOW = 0.02  # residuals far below this share of a pixel's largest observation have nearly equal weights
 
 
 def shadow_weights(observations: Floats) -> Floats:
@@ -74,13 +71,12 @@ def shade(scaled_normals: Floats, light_directions: Floats) -> Floats:
 
 
 def fit_scaled_normals(
-    observations: Floats, weights: Floats, light_directions: Floats, *, prior: float = _PRIOR
+    observations: Floats, weights: Floats, light_directions: Floats, *, prior: float = 1e-6
 ) -> Floats:
     """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
 
-    Args:
-        observations, weights: (P, F).
-        light_directions: (F, 3) or (P, F, 3), of any length.
+    Observations and weights are (P, F), light directions (F, 3) or (P, F, 3), of any length. The prior pulls towards a
+    black pixel, so that a pixel without three lit observations has a solution.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
@@ -97,7 +93,7 @@ def _sum_over_lights(values: Floats, terms: Floats) -> Floats:
 
 def absolute_weights(residuals: Floats) -> Floats:
     """Return weights with which the next weighted least squares approximates least absolute deviations."""
-    return np.asarray(1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW))
+    return np.asarray(1 / (np.abs(residuals) + 0.02))  # nearly equal weights far below this residual
 
 
 def fit_robustly(
@@ -105,12 +101,9 @@ def fit_robustly(
 ) -> tuple[Float64Array, Float64Array]:
     """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
 
-    Args:
-        values: (P, F), each pixel scaled to a largest value of 1.
-        lit: (P, F), weights that do not depend on the fit, for example from shadow_weights.
-        lights: (F, 3) or (P, F, 3), of any length.
-        fits: number of weighted fits, at least 1.
-        weights: of the first fit; None for `lit`.
+    Each pixel's values (P, F) are scaled to a largest value of 1. The weights `lit` (P, F) do not depend on the fit,
+    for example from shadow_weights; `weights` are those of the first fit, by default `lit`. The lights (F, 3) or (P, F,
+    3) have any length, and the number of weighted fits is at least 1.
     """
     weights = lit if weights is None else weights
     for _ in range(fits):

@@ -9,7 +9,7 @@ reflectance varies slowly. For a given normal the coefficients are linear, so on
 projection).
 
 The lowest intensities alone do not determine nine coefficients well. This module therefore differs from the paper in
-two ways. Coefficients are left out if few observations are kept (coefficient_count). All but the constant one have a
+two ways. Coefficients are left out if few observations are kept. All but the constant one have a
 Gaussian prior around zero, that is, around Lambert's law. The fit also estimates the noise that the prior is weighed
 against (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
 """
@@ -24,21 +24,11 @@ from torch.nn.functional import normalize
 
 from splinecli.fits.least_squares import lit_observations, weighted_least_squares
 
-FEWEST_LIT = 4  # number of brightest observations never treated as shadows: three for the normal, one for the noise
 RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
+# Order in which coefficients enter the model. Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come
+# first; within a degree, those with larger a.
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
-"""Order in which coefficients enter the model.
-
-Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come first; within a degree, those with larger a.
-"""
-
-
-SHADOW_SHARE = 0.4  # observations below this share of the pixel's quantile UNSHADED are shadows
-KEPT_SHARE, FEWEST_KEPT = 0.25, 8  # How many of the others are kept; see kept_count. The first is T_low in the paper.
-
-
-_ROUNDS, _STEPS = 5, 4  # estimates of the noise, and Levenberg-Marquardt steps for each
 
 
 def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
@@ -52,9 +42,9 @@ def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
     # The initial standard deviation, relative to the brightest kept observation
     noise = torch.full_like(normals[:, 0], 1e-3**2)
     damping = torch.full_like(noise, 1e-2)
-    for _ in range(_ROUNDS):
+    for _ in range(5):
         fit = _fit(problem, normals, noise)
-        for _ in range(_STEPS):
+        for _ in range(4):  # Levenberg-Marquardt steps
             trial = _fit(problem, fit.step(damping), noise)
             better = trial.cost < fit.cost
             damping = torch.where(better, damping * 0.2, damping * 5).clamp(1e-7, 1e4)
@@ -64,14 +54,8 @@ def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
 
 
 def kept_count(lit: Tensor) -> Tensor:
-    """Return how many of `lit` observations are kept: KEPT_SHARE, but at least FEWEST_KEPT, or all of fewer."""
-    return torch.maximum((KEPT_SHARE * lit).ceil().long(), lit.clamp(max=FEWEST_KEPT))
-
-
-def coefficient_count(kept: Tensor) -> Tensor:
-    """Return the number of coefficients, 1 to 9, for `kept` observations: two observations for each coefficient and for
-    each of the two angles of the normal."""
-    return (kept // 2 - 2).clamp(1, len(PLACE))
+    """Return how many of `lit` observations are kept: a quarter (T_low of the paper), at least 8, or all of fewer."""
+    return torch.maximum((0.25 * lit).ceil().long(), lit.clamp(max=8))
 
 
 class _Problem(NamedTuple):
@@ -113,7 +97,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
     count = observations.shape[1]
     view = lights.new_tensor((0.0, 0.0, 1.0))
     ordered, index = observations.sort(dim=1)
-    is_lit = lit_observations(observations, SHADOW_SHARE, fewest=FEWEST_LIT) & (observations > 0)
+    # The four brightest are never treated as shadows: three for the normal, one for the noise.
+    is_lit = lit_observations(observations, 0.4, fewest=4) & (observations > 0)
     lit = is_lit.sum(dim=1)
     kept = kept_count(lit)
 
@@ -131,7 +116,9 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
 
     order = torch.arange(3, dtype=lights.dtype, device=lights.device)
     degree = (order[:, None] + order).flatten()
-    left_out = torch.tensor(PLACE, device=lights.device) >= coefficient_count(kept)[:, None]
+    # Two observations for each coefficient, 1 to 9, and for each of the two angles of the normal.
+    coefficients = (kept // 2 - 2).clamp(1, len(PLACE))
+    left_out = torch.tensor(PLACE, device=lights.device) >= coefficients[:, None]
     return _Problem(
         intensities=intensities / torch.where(largest > 0, largest, 1),
         # A light of length zero does not contribute to any sum below.
@@ -167,7 +154,10 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     slope = (by_power[..., 1] + 2 * powers[..., 1] * by_power[..., 2]) / -RANGE
     change = (slope * shading)[..., None] * problem.bisectors
     change += (reflectance * (shading > 0))[..., None] * problem.lights
-    tangents = _tangents(normals)
+    # Two unit vectors orthogonal to each normal.
+    x, _, z = normals.unbind(dim=1)
+    first = normalize(torch.stack((z, torch.zeros_like(x), -x), dim=1), dim=1)
+    tangents = torch.stack((first, torch.linalg.cross(normals, first)), dim=-1)
     jacobian = change @ tangents
     absorbed = torch.linalg.solve_triangular(factor, design.mT @ jacobian, upper=False)
 
@@ -181,13 +171,6 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
         gradient=(jacobian.mT @ residual)[..., 0],
         curvature=jacobian.mT @ jacobian - absorbed.mT @ absorbed,
     )
-
-
-def _tangents(normals: Tensor) -> Tensor:
-    """Return two unit vectors (P, 3, 2) orthogonal to each normal."""
-    x, _, z = normals.unbind(dim=1)
-    first = normalize(torch.stack((z, torch.zeros_like(x), -x), dim=1), dim=1)
-    return torch.stack((first, torch.linalg.cross(normals, first)), dim=-1)
 
 
 def _powers(cosine: Tensor) -> Tensor:

@@ -28,15 +28,11 @@ from splinecli.maths import Float32Array, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
-
-
 MIN_PIXELS_PER_LIGHT = 10
-
-MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
-INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, if none were measured
-
-
-_ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
+LIGHT_ERROR_DEG, LARGEST_LIGHT_ERROR_DEG = 5.0, 30.0  # usual and largest error of a rough direction
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
+INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
+_MIN_PIXELS = 100
 _PRIOR = 1e-9
 
 
@@ -81,16 +77,17 @@ class Factors:
     def _fit_intensities(self, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
         # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
-        prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
+        # The weight of equal intensities against those that fit best, if none were measured.
+        prior = 0.01 * (self.matrix**2).sum(axis=0).mean()
         intensities = np.ones(light_directions.shape[:2])
-        for _ in range(_INTENSITY_ROUNDS):
+        for _ in range(12):
             vectors = intensities[..., None] * light_directions
             transposed = vectors.swapaxes(1, 2)
             products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may be coplanar
             matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
             along = np.einsum("cf,nfc->nf", self.matrix, matrices)
             intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
-            intensities = intensities.clip(*(0.1, 10.0))
+            intensities = intensities.clip(0.1, 10.0)
         return intensities, matrices
 
 
@@ -106,7 +103,7 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
     lit = (values > LIT_SHARE).astype(np.float64)
     matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
     weights = lit
-    for _ in range(_ROUNDS):
+    for _ in range(8):  # more rounds fit the highlights of metals
         rows = fit_scaled_normals(values, weights, matrix.T, prior=_PRIOR)
         matrix = fit_scaled_normals(values.T, weights.T, rows, prior=_PRIOR).T
         residuals = values - rows @ matrix
@@ -166,32 +163,12 @@ def sample_pixels(observations: Floats) -> Float64Array:
     # Pixels below this share of the brightest hundredth are left out as background. The second share is used if the
     # first leaves too few, because highlights outshine the object.
     for share in (0.1, 0.02):
-        _, values = lit_values(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
+        _, values = lit_values(observations, share, min(4000, max(120_000 // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
         kept: Float64Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
             break
     return kept
-
-
-LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
-
-LARGEST_LIGHT_ERROR_DEG = 30.0
-
-MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
-
-
-MAX_MISFIT = 0.018
-"""Largest median residual, as a share of a pixel's brightest observation, with which refined lights are taken. Metals
-have more, and a matte model would move their lights wrongly."""
-
-
-INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
-
-_MIN_PIXELS = 100
-_WORTH_PIXELS = 50.0  # see fit_near
-
-_FIRST_FITS, _FITS_PER_ROUND = 8, 2
 
 
 class LightFit(NamedTuple):
@@ -213,12 +190,8 @@ class LightFit(NamedTuple):
 def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
     """Return the capture with refined lights, or unchanged if they do not fit much better. A warning says which.
 
-    Args:
-        error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
-        intensities_known: whether the light intensities were measured.
-
-    Raises:
-        UsageError: the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
+    `error_deg` is the usual error of the given directions, by default LIGHT_ERROR_DEG. Raises UsageError if the capture
+    has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
     """
     check_distant("--refine-lights", "refines", near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
@@ -227,7 +200,12 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        kept = CaptureWarning(REFINEMENT_REJECTED, f"The light directions were not refined: {_why_kept(capture)}.")
+        reason = "no others near them fit the images much better"
+        if capture.n_lights < MIN_LIGHTS:
+            reason = f"there are fewer than {MIN_LIGHTS} lights"
+        elif _choose_pixels(capture.observations) is None:
+            reason = f"there are fewer than {_MIN_PIXELS} lit pixels"
+        kept = CaptureWarning(REFINEMENT_REJECTED, f"The light directions were not refined: {reason}.")
         return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:
@@ -260,14 +238,6 @@ def would_refine(observations: Floats, factors: Factors | None, light_directions
     return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
 
 
-def _why_kept(capture: Capture) -> str:
-    if capture.n_lights < MIN_LIGHTS:
-        return f"there are fewer than {MIN_LIGHTS} lights"
-    if _choose_pixels(capture.observations) is None:
-        return f"there are fewer than {_MIN_PIXELS} lit pixels"
-    return "no others near them fit the images much better"
-
-
 def check_distant(option: str, verb: str, *, near: bool) -> None:
     """Raise UsageError for a capture with near lamps under an option that refines or finds distant lights."""
     if near:
@@ -295,20 +265,17 @@ def refine_lights(
 ) -> LightFit | None:
     """Return refined lights; None if the images do not determine them, or the given lights fit about as well.
 
-    Args:
-        observations: (P, F), linear, divided by the light intensities.
-        light_directions: (F, 3), unit.
-        error_deg, intensities_known: see refine_capture.
+    The observations (P, F) are linear, divided by the light intensities; the directions (F, 3) are unit. See
+    refine_capture for the other arguments.
     """
     intensity_error = 0.0 if intensities_known else INTENSITY_ERROR
-    fit = fit_near(
-        observations, light_directions, error_deg, intensity_error=intensity_error, worth_pixels=_WORTH_PIXELS
-    )
+    fit = fit_near(observations, light_directions, error_deg, intensity_error=intensity_error, worth_pixels=50.0)
     if fit is None:
         return None
-    # Refined lights are taken if the median residual falls below this share of that under the given lights. On
-    # rendered captures with exact lights, it seldom does; docs/measurements.md has the figures.
-    better = fit.after < MAX_MISFIT and fit.fit_ratio < 0.7 and bool((fit.directions[:, 2] > 0).all())
+    # Refined lights are taken if the median residual falls below the second share of that under the given lights. On
+    # rendered captures with exact lights, it seldom does; docs/measurements.md has the figures. Metals have a larger
+    # residual than the first, and a matte model would move their lights wrongly.
+    better = fit.after < 0.018 and fit.fit_ratio < 0.7 and bool((fit.directions[:, 2] > 0).all())
     return fit if better else None
 
 
@@ -322,13 +289,9 @@ def fit_near(
 ) -> LightFit | None:
     """Return the lights near the given ones that fit the images best; None for too few lights or lit pixels.
 
-    Args:
-        observations: (P, F), linear.
-        light_directions: (F, 3), unit.
-        error_deg: the usual error of each direction (F,), or of all.
-        intensity_error: the usual error of intensities of 1, a share; 0 if they are known.
-        worth_pixels: the number of pixels that the images weigh against the prior. Errors of a matte model are alike in
-            many pixels.
+    The observations (P, F) are linear, and the directions (F, 3) are unit. `error_deg` is the usual error of each
+    direction (F,), or of all; `intensity_error` that of intensities of 1, a share; 0 if they are known. `worth_pixels`
+    is the number of pixels that the images weigh against the prior, because errors of a matte model are alike in many.
     """
     values = _choose_pixels(observations)
     if values is None:
@@ -336,17 +299,28 @@ def fit_near(
     reference = 0.1 * np.quantile(values, 0.6, axis=1, keepdims=True)  # as in IW12
     lit = (values > reference).astype(np.float64)
     lights = light_directions
-    normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)
+    normals, weights = fit_robustly(values, lit, lights, 8)
     before = _misfit(values, normals, lights, lit)
-    precision = _prior(light_directions, error_deg, intensity_error or INTENSITY_ERROR)
+    # The precision (F, 3, 3) of the given light vectors, along and across them. The angle has two components, each with
+    # half of its variance.
+    along = lights[:, :, None] * lights[:, None, :]
+    across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
+    precision = (np.eye(3) - along) / across_variance + along / (intensity_error or INTENSITY_ERROR) ** 2
     for _ in range(150):
-        normals, weights = fit_robustly(values, lit, lights, _FITS_PER_ROUND, weights)
-        moved = _move_lights(values, normals, weights, lights, light_directions, precision, worth_pixels)
-        moved = moved if intensity_error else unit(moved)
+        normals, weights = fit_robustly(values, lit, lights, 2, weights)
+        residuals = values - normals @ lights.T
+        variance = (weights * residuals**2).sum() / weights.sum()
+        # A light that does not reach any pixel keeps its given vector.
+        scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
+        curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
+        gradient = ((weights * residuals).T @ normals) * scale[:, None]
+        pull = np.einsum("fij,fj->fi", precision, light_directions - lights)
+        step = np.linalg.solve(curvature + precision, (gradient + pull)[..., None])[..., 0]
+        moved = lights + step if intensity_error else unit(lights + step)
         change, lights = np.abs(moved - lights).max(), moved
         if change < 1e-4:
             break
-    normals, _ = fit_robustly(values, lit, lights, _FIRST_FITS, weights)
+    normals, _ = fit_robustly(values, lit, lights, 8, weights)
     after = _misfit(values, normals, lights, lit)
     return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
 
@@ -361,32 +335,3 @@ def _choose_pixels(observations: Float32Array) -> Float64Array | None:
 
 def _misfit(values: Float64Array, normals: Float64Array, lights: Float64Array, lit: Float64Array) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
-
-
-def _prior(light_directions: Float64Array, error_deg: float | Float64Array, intensity_error: float) -> Float64Array:
-    """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
-    along = light_directions[:, :, None] * light_directions[:, None, :]
-    # The angle has two components, each with half of its variance.
-    across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
-    return np.asarray((np.eye(3) - along) / across_variance + along / intensity_error**2)
-
-
-def _move_lights(
-    values: Float64Array,
-    normals: Float64Array,
-    weights: Float64Array,
-    lights: Float64Array,
-    given: Float64Array,
-    precision: Float64Array,
-    worth_pixels: float,
-) -> Float64Array:
-    """Return the light vectors (F, 3) that fit the observations best, within the prior."""
-    residuals = values - normals @ lights.T
-    variance = (weights * residuals**2).sum() / weights.sum()
-    # A light that does not reach any pixel keeps its given vector.
-    scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
-    curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
-    gradient = ((weights * residuals).T @ normals) * scale[:, None]
-    pull = np.einsum("fij,fj->fi", precision, given - lights)
-    step = np.linalg.solve(curvature + precision, (gradient + pull)[..., None])[..., 0]
-    return np.asarray(lights + step)

@@ -31,10 +31,8 @@ from splinecli.system.machine import side_by_side
 def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Floats) -> Float32Array:
     """Return the points (N, 3) of a surface, in the unit of the lamps' positions.
 
-    Args:
-        rows, columns: (N,), in pixels; (0, 0) is the centre of the first pixel.
-        depth: (N,), as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here in
-            multiples of the mean plane's depth.
+    Rows and columns (N,) are in pixels; (0, 0) is the centre of the first pixel. The depth (N,) is as integrate_normals
+    returns it: the height in pixels, or with a camera matrix the depth, here in multiples of the mean plane's depth.
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
@@ -87,9 +85,8 @@ class PixelLighting:
 
 
 PixelIndices = Integers  # numbers of some of a capture's pixels, in the order of its mask
-LightingAt = Callable[
-    [PixelIndices], PixelLighting
-]  # from rows of a capture's pixels to their observations and light directions
+# From rows of a capture's pixels to their observations and light directions.
+LightingAt = Callable[[PixelIndices], PixelLighting]
 LIT_AT_ONCE = 1 << 14  # pixels whose light is requested at once: under near lamps, each has its own lights
 
 
@@ -118,13 +115,6 @@ def _turns_to_view(views: Floats) -> Floats:
     x, y, z = views.T
     a, b, c = x * x / (1 + z), x * y / (1 + z), y * y / (1 + z)
     return np.stack((1 - a, -b, -x, -b, 1 - c, -y, x, y, z), axis=1).reshape(-1, 3, 3)
-
-
-_BLOCKS = 1200  # parts of the surface that exchange light
-
-
-_DARK_SHARE = 0.02  # of the bright pixels' albedo; darker ones are background
-_LEAST_Z = 0.15  # of a block's normal, for its area
 
 
 class PixelPlaces:
@@ -161,8 +151,7 @@ class IndirectLight:
 
     def counts_at(self, observations: Float32Array, pixels: PixelIndices) -> Bools:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
-        # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at
-        # most.
+        # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most.
         return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
@@ -171,26 +160,30 @@ def find_indirect_light(
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None if the attached shadows show none that could be removed.
 
-    The camera is always treated as orthographic, because only nearby parts exchange much light.
-
-    Args:
-        mask: (H, W), with P true pixels.
-        observations: (P, F), as they were photographed, divided by the intensities alone.
-        lighting_at: gives the observations of some pixels without the falloff of near lamps, and the light directions.
-        normals: (P, 3) unit, in the capture's frame.
+    The camera is always treated as orthographic, because only nearby parts exchange much light. The mask (H, W) has P
+    true pixels. The observations (P, F) are as they were photographed, divided by the intensities alone; `lighting_at`
+    gives them without the falloff of near lamps, and the light directions. The normals (P, 3) are unit, in the
+    capture's frame.
     """
     pixels = PixelPlaces(mask)
     parts = partial(parts_of_pixels, len(normals))
-    albedo = np.concatenate([*side_by_side(lambda rows: _albedo(lighting_at(rows), normals[rows]), parts())])
+
+    def matte_albedo(rows: PixelIndices) -> Float32Array:
+        light = lighting_at(rows)
+        cosines = _cosines(light, normals[rows]).clip(min=0)
+        shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
+        return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
+
+    albedo = np.concatenate([*side_by_side(matte_albedo, parts())])
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
         return None
     # A mean that hardly depends on how much dark background there is.
     bright = float(albedo @ albedo) / total
-    lit = albedo > _DARK_SHARE * bright
+    lit = albedo > 0.02 * bright  # darker ones are background
     object_mask = mask.copy()
     object_mask[mask] = lit
-    blocks = Blocks.over(object_mask, _BLOCKS)
+    blocks = Blocks.over(object_mask, 1200)
     n_blocks = np.count_nonzero(blocks.mask)
 
     def sum_up(rows: PixelIndices) -> Float64Array:
@@ -235,7 +228,7 @@ def _exchange(blocks: Blocks, covered: Float64Array, normals: Float64Array, sent
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
     entering = np.einsum("ijk,ik->ij", towards, facing).clip(min=0)
-    area = (covered / normals[:, 2].clip(min=_LEAST_Z)).astype(np.float32)
+    area = (covered / normals[:, 2].clip(min=0.15)).astype(np.float32)
     # The form factor of a small part (Goral et al., "Modeling the interaction of light between diffuse surfaces", 1984)
     factors = leaving * entering * area / (np.pi * np.square(square))
     factors /= factors.sum(axis=1, keepdims=True).clip(min=1)
@@ -264,8 +257,7 @@ def _exposure(
         return None
     with np.errstate(invalid="ignore"):  # black shadows have no correlation
         correlation = np.corrcoef(seen, gathered)[0, 1]
-    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes,
-    # metal.
+    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes, metal.
     if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
@@ -274,13 +266,6 @@ def _exposure(
         with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
-
-
-def _albedo(light: PixelLighting, normals: Float32Array) -> Float32Array:
-    """Return the albedos (n,) of matte pixels, in the unit of the observations."""
-    cosines = _cosines(light, normals).clip(min=0)
-    shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
-    return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
 
 
 def _cosines(light: PixelLighting, normals: Float32Array) -> Float32Array:

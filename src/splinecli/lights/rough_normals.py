@@ -34,9 +34,7 @@ class RoughNormals:
 
     normals: Float64Array  # (h, w, 3), unit in the mask, zero outside
     mask: Bools  # (h, w)
-    outward: (
-        Float64Array  # (h, w, 2), unit vectors, x right and y up, that point out of the mask at the rim; zero elsewhere
-    )
+    outward: Float64Array  # (h, w, 2), unit, x right and y up, pointing out of the mask at the rim; zero elsewhere
 
     @property
     def rim_steepness(self) -> float:
@@ -114,13 +112,10 @@ def median_turn_deg(
     It is the error of the first reading if the second is right. Each is a robust fit of observations (P, F) under
     lights (F, 3) or (P, F, 3); None for the observations of the first reading.
     """
-    readings = (
-        (observations, lights),
-        (observations if other_observations is None else other_observations, other_lights),
-    )
+    others = observations if other_observations is None else other_observations
     step = max(1, len(observations) // _TURNED_PIXELS)
     normals = []
-    for values, directions in readings:
+    for values, directions in ((observations, lights), (others, other_lights)):
         values = values[::step].astype(np.float64)
         values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
         own = directions if directions.ndim == 2 else directions[::step]
@@ -130,25 +125,19 @@ def median_turn_deg(
 
 def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
     """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H, W)."""
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(vectors)
     smooth = gaussian_filter(normals, (SMOOTHING, SMOOTHING, 0))
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
-    return RoughNormals(smooth, mask, _outward(mask))
-
-
-def _outward(mask: Bools) -> Float64Array:
-    """Return unit vectors (h, w, 2) out of the mask at its rim, leaving out the border of the image."""
-    from scipy.ndimage import distance_transform_edt
-
-    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
+    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")  # the border of the image is no rim
     if padded.all():
-        return np.zeros((*mask.shape, 2))
+        return RoughNormals(smooth, mask, np.zeros((*mask.shape, 2)))
     inner = slice(RIM_PIXELS + 1, -RIM_PIXELS - 1)
     rim = (mask & (distance_transform_edt(padded)[inner, inner] <= RIM_PIXELS))[..., None]
-    return np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
+    outward = np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
+    return RoughNormals(smooth, mask, outward)
 
 
 def outward_directions(mask: Bools, sigma: float) -> Float64Array:
@@ -171,7 +160,7 @@ MISSING, MISSING_OF_OTHER = 0.02, 0.1
 other reading has less than the second number times this share."""
 
 
-_MAX_PIXELS, _MAX_LIGHTS = 6000, 24
+_MAX_PIXELS = 6000
 _LIT_SHARE, _DARK_SHARE = 0.25, 0.4  # of a pixel's brightest shading, and of its own, beyond which shadows are judged
 _MARGIN = 0.5  # pixels that a surface must rise above a ray
 
@@ -219,7 +208,7 @@ class ShadowCheck:
         rows = np.zeros(normals.mask.shape, np.intp)
         rows[normals.mask] = np.arange(len(observations))
         coarse = RoughNormals(normals.normals[part], normals.mask[part], normals.outward[part])
-        chosen = np.linspace(0, len(lights) - 1, min(len(lights), _MAX_LIGHTS)).astype(int)
+        chosen = np.linspace(0, len(lights) - 1, min(len(lights), 24)).astype(int)
         values = observations[rows[part][coarse.mask]].astype(np.float64)
         values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
         shading = fit_robustly(values, shadow_weights(values), lights, _FITS)[0] @ lights[chosen].T

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splinecli.capture.record import FoundLights, azimuth_of
 from splinecli.errors import InputError
@@ -36,28 +35,20 @@ from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
-# Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions (3 % without the outline).
-_SHADOW_LOG_ODDS, _OUTLINE_LOG_ODDS = 11.0, 8.0
-
-_BLOCKS = 1200  # at most twice as many
 _FITS = 5
 _LEAST_Z = 0.1  # of normals that are integrated
-_SHADOW = 0.5  # of the predicted brightness
 _DARK_SHARE = 0.02  # of the brightest hundredth
-
 _LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)  # logarithms of the factors of the heights of the lights that are tried
-_ALBEDO_BIN, _ALBEDO_BINS = 0.1, 41  # of the logarithm of the albedo
+_ALBEDO_BINS = 41  # of 0.1, of the logarithm of the albedo
 
 
 def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> float:
     """Return the log odds that the lights are right against that their x and y are negated.
 
-    Args:
-        observations: (P, F), linear, divided by the light intensities.
-        mask: (H, W) with P true pixels, in row-major order.
-        light_directions: (F, 3), unit.
+    The observations (P, F) are linear, divided by the light intensities. The mask (H, W) has P true pixels, in
+    row-major order, and the directions (F, 3) are unit.
     """
-    blocks = Blocks.over(mask, _BLOCKS)
+    blocks = Blocks.over(mask, 1200)
     values, mask = blocks.average(observations, mask).astype(np.float64), blocks.mask
     brightest = values.max(axis=1, keepdims=True)
     bright = brightest > _DARK_SHARE * np.quantile(brightest, 0.99)
@@ -74,12 +65,13 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
     predicted = scaled @ light_directions.T
     # Where so much is predicted of a pixel's brightest observation, darkness is a cast shadow.
     facing = bright & (predicted > 0.15)
-    dark = values[facing] < _SHADOW * predicted[facing]
+    dark = values[facing] < 0.5 * predicted[facing]
     bump, hollow = (
         _correlation(cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark)
         for sign in (1, -1)
     )
-    return _SHADOW_LOG_ODDS * (bump - hollow) + _OUTLINE_LOG_ODDS * outline
+    # Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions, or 3 % without outline.
+    return 11.0 * (bump - hollow) + 8.0 * outline
 
 
 def _correlation(predicted: Bools, seen: Bools) -> float:
@@ -93,12 +85,8 @@ def lower_lights(observations: Float32Array, light_directions: Float64Array, err
     """Return low lights (F, 3), lowered together towards those under which the albedo has few values; others as given.
 
     The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity
-    by entropy minimization", CVPR 2007). Lights are only lowered, as the network's errors are upwards.
-
-    Args:
-        observations: (P, F), linear, divided by the light intensities.
-        light_directions: (F, 3), unit.
-        error_deg: the mean expected error.
+    by entropy minimization", CVPR 2007). Lights are only lowered, as the network's errors are upwards. The
+    observations (P, F) are linear, divided by the light intensities; `error_deg` is the mean expected error.
     """
     # The network finds lower lights too high.
     if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
@@ -118,27 +106,16 @@ def lower_lights(observations: Float32Array, light_directions: Float64Array, err
 def _entropy(scaled_normals: Float64Array) -> float:
     """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their median."""
     albedo = np.log(np.linalg.norm(scaled_normals, axis=1))
-    places = np.rint((albedo - np.median(albedo)) / _ALBEDO_BIN) + _ALBEDO_BINS // 2
+    places = np.rint((albedo - np.median(albedo)) / 0.1) + _ALBEDO_BINS // 2
     counts = np.bincount(places.clip(0, _ALBEDO_BINS - 1).astype(int), minlength=_ALBEDO_BINS)
     shares = np.convolve(counts / len(albedo), (0.25, 0.5, 0.25))
     return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum())
 
 
-Array = NDArray[np.float64]
-
-
-_RIM_Z = 0.25
-"""Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
-
-_LIT_SHARE, _RIM_DARK_SHARE, _MIN_LIT, _RIM_FITS = 0.1, 0.02, 4, 6
-_EQUAL_WEIGHT_BELOW, _PRIOR = 0.1, 1e-3
-_ROUNDS, _CONVERGED = 25, 1e-4
-
-
 class OutlineTurn(NamedTuple):
     """A rotation that turns the normals at the outline outwards."""
 
-    rotation: Array  # (3,), the rotation vector of lights and normals
+    rotation: Float64Array  # (3,), the rotation vector of lights and normals
     # median absolute residual in z of these normals; small if a smooth surface forms the outline
     spread: float
 
@@ -147,22 +124,17 @@ class OutlineTurn(NamedTuple):
         """The angle of the rotation."""
         return float(np.degrees(np.linalg.norm(self.rotation)))
 
-    def share(self, part: float) -> Array:
+    def share(self, part: float) -> Float64Array:
         """Return a part of the rotation (3, 3), from 0 to 1."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
 
 
-def turn_at_outline(
-    observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
-) -> OutlineTurn | None:
+def turn_at_outline(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> OutlineTurn | None:
     """Return the rotation of the lights that the outline shows, or None. The border of the image is ignored.
 
-    Args:
-        observations: (P, F), linear, divided by the light intensities.
-        mask: (H, W) with P true pixels, in row-major order.
-        light_directions: (F, 3), unit.
+    See bump_log_odds for the arguments.
     """
     from scipy.spatial.transform import Rotation
 
@@ -171,21 +143,22 @@ def turn_at_outline(
         return None
     along = np.cross((0.0, 0.0, 1.0), outwards)
     turn = Rotation.identity()
-    for _ in range(_ROUNDS):
+    for _ in range(25):
         turned = turn.apply(normals)
         # A small rotation w adds w x n. The first residual is along the view axis, the second along the outline.
-        residuals = np.stack((turned[:, 2] - _RIM_Z, (turned * along).sum(axis=1)))
+        # Normals within a pixel of the outline have a z of about 0.25, as pixels have a size and masks lie inside.
+        residuals = np.stack((turned[:, 2] - 0.25, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
-        weights = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
-        curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + _PRIOR * np.eye(3)
+        weights = 1 / (np.abs(residuals) + 0.1)
+        curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + 1e-3 * np.eye(3)
         step = np.linalg.solve(curvature, -np.einsum("kp,kpi,kp->i", weights, slopes, residuals))
         turn = Rotation.from_rotvec(step) * turn
-        if np.abs(step).max() < _CONVERGED:
+        if np.abs(step).max() < 1e-4:
             break
     return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
 
 
-def outline_share(mask: NDArray[np.bool_]) -> float:
+def outline_share(mask: Bools) -> float:
     """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of the image."""
     boundary = _boundary(mask)
     # Masks of objects that fill the image may leave out a border of this share of its sides
@@ -194,7 +167,7 @@ def outline_share(mask: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
 
 
-def _boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _boundary(mask: Bools) -> Bools:
     """Return the pixels of a mask (H, W) at its outer boundary; holes have none."""
     from scipy.ndimage import binary_erosion, binary_fill_holes
 
@@ -202,44 +175,33 @@ def _boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
 
 
-def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array) -> tuple[Array, Array]:
+def _rim(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
-    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls
-    # outwards.
+    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards.
     width = max(1.5, 0.02 * float(np.sqrt(np.count_nonzero(mask))))
     outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
     values = observations[rim[mask]].astype(np.float64)
     brightest = values.max(axis=1, keepdims=True, initial=0)
     values = values / np.maximum(brightest, 1e-12)
-    lit = (values > _LIT_SHARE).astype(np.float64)
-    bright = brightest[:, 0] > _RIM_DARK_SHARE * np.quantile(observations.max(axis=1), 0.99)
-    seen = (lit.sum(axis=1) >= _MIN_LIT) & bright & outwards.any(axis=1)
+    lit = (values > 0.1).astype(np.float64)
+    bright = brightest[:, 0] > _DARK_SHARE * np.quantile(observations.max(axis=1), 0.99)
+    seen = (lit.sum(axis=1) >= 4) & bright & outwards.any(axis=1)
     if not seen.any():
         return np.empty((0, 3)), np.empty((0, 3))
-    fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, _RIM_FITS)
+    fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, 6)
     return unit(fitted), outwards[seen]
 
 
-LARGEST_ERROR_DEG = 20.0
-"""Lights with a larger expected error on average are refused, because their normals would be of little use."""
-
-
-# Chosen on rendered scenes that the network was not trained on.
-_WORTH_PIXELS = 6.0  # see fit_near
-# Log odds that the network does not confuse bumps with hollows: lower if it expects larger errors.
-_MOST_LOG_ODDS, _LOG_ODDS_PER_DEG, _FEWEST_LOG_ODDS = 7.0, 0.25, 1.0
-# Mean error of the returned lights, from the error that the network expects, fitted on 720 rendered captures with and
-# without an outline: it expects too much of easy objects. The third is added in quadrature, for photographs.
-_ERROR_SCALE, _ERROR_POWER, _LEAST_ERROR_DEG = 0.39, 1.3, 1.2
+LARGEST_ERROR_DEG = 20.0  # mean expected error of lights; larger ones are refused, as their normals would be useless
 _MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 
 
 def find_lights(
-    observations: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    observations: Float32Array,
+    mask: Bools,
     intensities_known: bool,
     *,
     first_light: str | None = None,
@@ -247,17 +209,13 @@ def find_lights(
 ) -> FoundLights:
     """Find the lights of the images of one object.
 
-    Args:
-        observations: (P, F), linear, 0 or more; divided by the light intensities if they are known.
-        mask: (H, W) with P true pixels, in row-major order.
-        intensities_known: whether the intensities are known; else they are found, too.
-        first_light: where the light of the first observations comes from; see azimuth_of. It decides between a bump and
-            a hollow. Without it, shadows and the outline decide.
-        refuse: raise an error if the images do not determine the lights; else return a guess.
+    The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are known; else these
+    are found, too. The mask (H, W) has P true pixels, in row-major order. `first_light` is where the light of the first
+    observations comes from, see azimuth_of; it decides between a bump and a hollow. Without it, shadows and the outline
+    decide. If the images do not determine the lights, an error is raised, or without `refuse` a guess is returned.
 
-    Raises:
-        UsageError: the first light is neither a known side nor an azimuth.
-        InputError: the images are all alike, do not show one surface, or do not determine the lights.
+    Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the images are all alike,
+    do not show one surface, or do not determine the lights.
     """
     step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
     if step > 1:
@@ -281,7 +239,7 @@ def find_lights(
     if not intensities_known:
         observations = np.asarray(observations / intensities, np.float32)
     error = 0.0 if intensities_known else INTENSITY_ERROR
-    fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=_WORTH_PIXELS)
+    fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=6.0)
     # Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes,
     # including metals, reach at most half of this value.
     if refuse and fit is not None and fit.after > 0.08:
@@ -294,7 +252,8 @@ def find_lights(
     expected_deg, opposite_share = float(errors_deg.mean()), 0.0
     if first_light is None:
         log_odds = bump_log_odds(observations, mask, directions)
-        log_odds += max(_FEWEST_LOG_ODDS, _MOST_LOG_ODDS - _LOG_ODDS_PER_DEG * expected_deg)
+        # The network seldom confuses bumps with hollows, but more often if it expects larger errors.
+        log_odds += max(1.0, 7.0 - 0.25 * expected_deg)
         directions = directions * (-1, -1, 1) if log_odds < 0 else directions
         opposite_share = 1 / (1 + math.exp(abs(log_odds)))
     turn = turn_at_outline(observations, mask, directions)
@@ -304,8 +263,10 @@ def find_lights(
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
-    found_deg = _ERROR_SCALE * expected_deg**_ERROR_POWER if outlined else 0.65 * expected_deg  # without an outline
-    errors_deg = errors_deg * math.hypot(found_deg, _LEAST_ERROR_DEG) / expected_deg
+    # Mean error of these lights, from the error that the network expects, fitted on 720 rendered captures: it expects
+    # too much of easy objects. The 1.2 degrees are for photographs.
+    found_deg = 0.39 * expected_deg**1.3 if outlined else 0.65 * expected_deg
+    errors_deg = errors_deg * math.hypot(found_deg, 1.2) / expected_deg
     opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
@@ -318,7 +279,7 @@ def find_lights(
     return FoundLights(directions, errors_deg, None if intensities_known else intensities / intensities.mean())
 
 
-def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.float64]:
+def _towards(directions: Float64Array, first_light: str) -> Float64Array:
     """Return the directions (F, 3), or those with opposite x and y, whichever has the first light on this side.
 
     Raises InputError if it is not clearly on either side.
@@ -333,7 +294,7 @@ def _towards(directions: NDArray[np.float64], first_light: str) -> NDArray[np.fl
     return directions * (-1, -1, 1) if towards < 0 else directions
 
 
-def _check_different(observations: NDArray[np.float32]) -> None:
+def _check_different(observations: Float32Array) -> None:
     """Raise InputError if the light does not change between the images."""
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is not a change of the light
@@ -344,9 +305,7 @@ def _check_different(observations: NDArray[np.float32]) -> None:
         raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
 
 
-def _ask_network(
-    observations: NDArray[np.float32], mask: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _ask_network(observations: Float32Array, mask: Bools) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
 
     They are means over the four rotations of the images by 90 degrees and their mirror images.

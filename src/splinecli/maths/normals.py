@@ -18,7 +18,6 @@ Convention = Literal["opengl", "directx"]
 
 # The background of an encoded image may be gray, which stands for the zero vector. No real normal is this short.
 SHORTEST_IN_PICTURE = 0.5
-
 _Float = TypeVar("_Float", bound=np.floating)
 
 
@@ -82,16 +81,13 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class AngularErrors:
-    """Statistics of the angular error over the pixels that have a ground truth.
+    """Statistics of the angular error over the pixels that have a ground truth."""
 
-    Args:
-        mean, median, p90: mean (MAE), median and 90th percentile, in degrees.
-        under_5, under_10: shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees.
-    """
-
+    # mean (MAE), median, p90 (90th percentile): in degrees
     mean: float
     median: float
     p90: float
+    # under_5, under_10: shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees
     under_5: float
     under_10: float
 
@@ -129,9 +125,7 @@ def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
 def gradient_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the surface is too steep.
 
-    Args:
-        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
-        mask: (H, W).
+    The normals (H, W, 3) are unit in the mask (H, W); x right, y up, z to the camera.
     """
     # Normals beyond 87 degrees from the camera axis have no usable slope.
     z = np.where(mask & (normal_map[..., 2] >= 0.05), normal_map[..., 2], np.nan)
@@ -143,11 +137,8 @@ def curvature_of_normals(
 ) -> NDArray[np.float32]:
     """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
 
-    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative mean curvature.
-
-    Args:
-        normal_map, mask: see gradient_of_normals.
-        sigma: standard deviation of a Gaussian filter of the normals, in pixels. Noise falls with its square.
+    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative mean curvature. The
+    normals are filtered with a standard deviation of `sigma` pixels; noise falls with its square.
     """
     (xx, xy), (yx, yy) = (_derivatives(normal_map[..., component], mask, sigma) for component in (0, 1))
     curvatures = np.stack(((xx + yy) / 2, xx * yy - xy * yx), axis=-1)

@@ -43,8 +43,7 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "ev
 
 @lru_cache(maxsize=8)
 def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
-    """Return the light directions at the centres of the cells (size, size, 3), and a mask of the unit disc (size,
-    size).
+    """Return the light directions at the centres of the cells (size, size, 3), and the mask (size, size) of the disc.
 
     No light can be in a cell outside the disc. Its direction is a zero vector.
     """
@@ -65,7 +64,7 @@ def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
     """
     if grid == "even":
         return cell_directions(size)[1]
-    doubled = 2 * torch.arange(size) - (size - 1)
+    doubled = 2 * torch.arange(size, device="cpu") - (size - 1)
     return doubled[:, None] ** 2 + doubled**2 < (size - 1) ** 2
 
 
@@ -74,9 +73,8 @@ def sparse_map(
 ) -> SparseMap:
     """Return the sparse maps of values (P, F) or (P, F, C). Values of lights in the same cell are averaged.
 
-    Args:
-        light_directions: (F, 3), or (P, F, 3) if each pixel has its own lights.
-        valid: (P, F) bool, false for observations to leave out. None takes all.
+    The directions are (F, 3), or (P, F, 3) if each pixel has its own lights. Values that are not valid (P, F) are left
+    out.
     """
     if values.ndim == 2:
         values = values[..., None]

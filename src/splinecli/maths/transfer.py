@@ -13,41 +13,28 @@ from splinecli.maths import Float64Array
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
+# The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states it; else linear.
 AUTOMATIC = "auto"
-"""The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states it; else linear."""
-
+# An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1.
 TransferCurve = float | tuple[float, ...] | None
-"""An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1."""
-
 SRGB: TransferCurve = None
-
-
-def _decode_bt709(stored: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(stored < 0.081, stored / 4.5, ((stored + 0.099) / 1.099) ** (1 / 0.45))
-
-
-BT709: TransferCurve = tuple(_decode_bt709(np.linspace(0, 1, 256)).tolist())
-"""The curve of most films (ITU-R BT.709), for values of 8 bits."""
-
-GAMMAS = 0.1, 10.0
-"""The smallest and the largest exponent."""
+_CODES = np.linspace(0, 1, 256)
+# The curve of most films (ITU-R BT.709), for values of 8 bits.
+BT709: TransferCurve = tuple(np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist())
+GAMMAS = 0.1, 10.0  # the smallest and the largest exponent
 
 
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
-    encoded: NDArray[np.uint8] = np.rint(255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)).astype(
-        np.uint8
-    )
-    return encoded
+    return np.asarray(np.rint(255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)), np.uint8)
 
 
 def parse_transfer(text: str) -> float | None:
     """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear" and AUTOMATIC, None for "srgb".
 
-    Raises:
-        UsageError: the name is unknown, or G is not between 0.1 and 10.
+    Raises UsageError if the name is unknown, or G is not between 0.1 and 10.
     """
     named: dict[str, float | None] = {AUTOMATIC: 1.0, "linear": 1.0, "srgb": None}
     if text in named:
@@ -75,7 +62,6 @@ def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArra
 
 
 LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Profiles of cameras and screens have a few kilobytes.
-
 _SAMPLES = 4096  # of a curve that has no name
 _SAME = 1e-3  # difference of linear values below which two curves are considered equal
 
@@ -84,7 +70,11 @@ _SAME = 1e-3  # difference of linear values below which two curves are considere
 def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
     """Return the name and the curve of a profile; None if it is damaged or has no single curve."""
     try:
-        tags = _tags(profile)
+        if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
+            return None
+        (count,) = struct.unpack_from(">I", profile, 128)
+        places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))]
+        tags = {name: profile[start : start + length] for name, start, length in places}
         curves = [_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
         name = _text(tags[b"desc"]) if b"desc" in tags else ""
     except (struct.error, ValueError, IndexError, OverflowError):
@@ -95,14 +85,6 @@ def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
         return None
     named = (curve for curve in (1.0, SRGB) if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME)
     return name, next(named, curves[0])
-
-
-def _tags(profile: bytes) -> dict[bytes, bytes]:
-    if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
-        raise ValueError
-    (count,) = struct.unpack_from(">I", profile, 128)
-    places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))]
-    return {name: profile[start : start + length] for name, start, length in places}
 
 
 def _curve(tag: bytes) -> TransferCurve:

@@ -12,62 +12,38 @@ from splinecli.errors import ModelError, check_one_of
 from splinecli.methods.estimator import Estimator, LeastSquares
 from splinecli.system.machine import Device, Precision
 
-__all__ = [
-    "DEFAULT_METHOD",
-    "METHODS",
-    "Estimator",
-    "Method",
-    "MethodOptions",
-    "check_method",
-    "make_estimator",
-    "method_names",
-]
-
+__all__ = ["METHODS", "Estimator", "Method", "MethodOptions", "check_method", "make_estimator", "method_names"]
 DEFAULT_METHOD = "spline-net"
 
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Settings of a method, None for its default. Each method ignores those that do not apply to it.
+    """Settings of a method, None for its default. Each method ignores those that do not apply to it."""
 
-    weights: a shipped name or a file.
-    rotations: number of rotations of the lights whose normals a network averages.
-    batch_size: pixels per batch. A processor computes a batch on each core.
-    device: where to compute; "auto" is a CUDA GPU if there is one.
-    precision: number format of a network; "auto" is bfloat16 if the device computes natively in it.
-    """
-
-    weights: str | None = None
-    rotations: int | None = None
-    batch_size: int | None = None
-    device: Device = "auto"
-    precision: Precision = "auto"
+    weights: str | None = None  # a shipped name or a file
+    rotations: int | None = None  # number of rotations of the lights whose normals a network averages
+    batch_size: int | None = None  # pixels per batch. A processor computes a batch on each core
+    device: Device = "auto"  # where to compute; "auto" is a CUDA GPU if there is one
+    precision: Precision = "auto"  # of a network; "auto" is bfloat16 if the device computes natively in it
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of METHODS.
+    """A row of METHODS."""
 
-    make: returns the estimator from the method's name and its options, and does the heavy imports.
-    principle, source: for the documentation; without a source, the method is splinecli's own.
-    observation_maps: whether figures of evaluations can show its observation maps.
-    """
-
-    make: Callable[[str, MethodOptions], Estimator]
+    make: Callable[[str, MethodOptions], Estimator]  # from the method's name and its options; does the heavy imports
+    # principle, source: for the documentation; without a source, the method is splinecli's own
     principle: str
     source: str = "-"
-    observation_maps: bool = False
+    observation_maps: bool = False  # whether figures of evaluations can show its observation maps
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
     """Return the estimator of this name.
 
     Methods that run in PyTorch limit its threads to the cores that the process may use; see
-    splinecli.system.machine.use_available_cores.
-
-    Raises:
-        UsageError: the name, the device or a number is not valid.
-        ModelError: the weights cannot be used.
+    splinecli.system.machine.use_available_cores. Raises UsageError if the name, the device or a number is not valid,
+    ModelError if the weights cannot be used.
     """
     check_method(name)
     return METHODS[name].make(name, options)

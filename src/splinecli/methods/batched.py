@@ -85,12 +85,9 @@ def estimate_in_batches(
 ) -> NDArray[np.float32]:
     """Call `solve` on batches of observations, side by side, and return its results (P, columns) as float32.
 
-    Args:
-        solve: returns unit normals in its first three columns. Zero vectors are replaced by (0, 0, 1).
-        observations: (P, F); `solve` gets them unscaled.
-        light_directions: (F, 3) or (P, F, 3).
-        columns: number of columns that `solve` returns. Those behind the normal are not changed.
-        progress: called after each batch with the number of its pixels.
+    `solve` returns unit normals in the first three of its columns; zero vectors are replaced by (0, 0, 1), and the
+    other columns are not changed. It gets the observations (P, F) unscaled; the light directions are (F, 3) or (P, F,
+    3). `progress` is called after each batch with the number of its pixels.
     """
     results = np.empty((len(observations), columns), np.float32)
 
@@ -120,14 +117,10 @@ ROTATION_SPAN_DEG = 20.0
 class NetworkEstimator(Estimator):
     """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
 
-    Args:
-        name: the method's name in the registry.
-        precision: the number format of the convolutions.
-        refines: whether the refinement net, if the weights have one, corrects the map afterwards.
-        rotations: number R of averaged estimates, see `rotations_of`.
-        batch_size: pixels per batch; memory grows with it (about 0.25 MB a pixel).
-
-    Raises UsageError if rotations or batch_size is below 1.
+    `name` is the method's name in the registry, `precision` the number format of the convolutions, and `rotations` the
+    number of averaged estimates, see `rotations_of`. With `refines`, the refinement net, if the weights have one,
+    corrects the map afterwards. Memory grows with the batch size, by about 0.25 MB a pixel. Raises UsageError if
+    rotations or batch_size is below 1.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 One capture has one set of lights and a few materials, so most of its pixels are redundant. Under near lamps, the lights
 change smoothly over the image. The network estimates a sample of the pixels, and the perceptron learns from this sample
-and estimates the rest about 80 times as fast. The part that the perceptron does not follow is mostly the network's
+and estimates the rest over 100 times as fast. The part that the perceptron does not follow is mostly the network's
 noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
@@ -68,11 +68,8 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
 
     The pixels are grouped around centres: each further centre is the pixel farthest from all centres so far (Gonzalez,
     Clustering to minimize the maximum intercluster distance, 1985). Rare appearances thereby get groups of their own.
-
-    Args:
-        features: (P, C) of the pixels that may be drawn, in any order.
-        generator: on the CPU.
-        rare_share: largest share of the pixels in groups that are considered rare.
+    The features (P, C) are of the pixels that may be drawn, and the generator is on the CPU. `rare_share` is the
+    largest share of the pixels in groups that are considered rare.
     """
     order = torch.randperm(len(features), generator=generator)
     size = min(size, len(features) // 2)
@@ -160,9 +157,7 @@ class Perceptron(nn.Module):
     def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
         """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/li_ne_net.py.
 
-        Args:
-            inputs: (P, C), see `inputs`.
-            bfloat16: whether the hidden layers compute in it. The rest is in float32.
+        For the inputs (P, C), see `inputs`. Only the hidden layers compute in bfloat16.
         """
         scaled = (inputs - self.mean) / self.spread
         with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -315,15 +310,9 @@ def distil(
 ) -> DistilledEstimator:
     """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of the pixels.
 
-    The result is the same for the same seed.
-
-    Args:
-        teacher: has confidence, and is bound to the capture.
-        lighting_at, n_pixels: see Estimator.bind.
-        progress: called with numbers of pixels; in all, twice the pixels of the sample.
-
-    Raises:
-        UsageError: too few pixels are lit for a sample of FEWEST_PIXELS.
+    The result is the same for the same seed. The teacher has confidence, and is bound to the capture; see
+    Estimator.bind. `progress` is called with numbers of pixels; in all, twice the pixels of the sample. Raises
+    UsageError if too few pixels are lit for a sample of FEWEST_PIXELS.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     light = lighting_at(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
@@ -336,8 +325,8 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False), torch.enable_grad():
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        # At most 1 % of the pixels, and twice the sample, are of rare kinds and go through the network.
-        rare_share = min(0.01, 2 * size.sample / n_pixels)
+        # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through the network.
+        rare_share = min(0.005, size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         pixels = sample.rows.numpy()
         taught = teacher.estimate_with_error(candidates[pixels], directions_at(directions, pixels), progress=progress)

@@ -43,14 +43,14 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
-    return StudentSize(usual, max(500, usual // 10), 192), StudentSize(larger, max(500, larger // 10), 320)
+    return StudentSize(usual, max(500, usual // 10), 128), StudentSize(larger, max(500, larger // 10), 256)
 
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
+# (F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to the
+# camera.
 Directions = NDArray[np.floating]
-"""(F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
-the camera."""
 
 
 def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) -> Directions:
@@ -89,12 +89,8 @@ class Estimator(ABC):
     ) -> NDArray[np.floating]:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
-        A pixel that is dark under every light has no normal. It gets (0, 0, 1).
-
-        Args:
-            observations: (P, F).
-            light_directions: (F, 3), or (P, F, 3).
-            progress: called after each batch with the number of its pixels.
+        A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations are (P, F), the light
+        directions (F, 3) or (P, F, 3). `progress` is called after each batch with the number of its pixels.
         """
 
     def estimate_with_error(
@@ -108,11 +104,9 @@ class Estimator(ABC):
         return self.estimate(observations, light_directions, progress=progress), None
 
     def bind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
-        """Return the estimator for the pixels of one capture, possibly with an encoded sample as context.
+        """Return the estimator for the `n_pixels` pixels of one capture, possibly with an encoded sample as context.
 
-        Args:
-            lighting_at: gives the observations and the light directions of some pixels.
-            n_pixels: of the capture.
+        `lighting_at` gives the observations and the light directions of some pixels.
         """
         return self
 
@@ -129,9 +123,7 @@ class Estimator(ABC):
     ) -> ObservationMaps | None:
         """Return the observation maps of some pixels, or None for a method without them.
 
-        Args:
-            observations, all_observations: (P, F) and (P, F') of the same pixels.
-            light_directions, all_directions: (F, 3) and (F', 3).
+        The observations (P, F) and (P, F') are of the same pixels, under directions (F, 3) and (F', 3).
         """
         return None
 
@@ -151,8 +143,7 @@ class ObservationMaps(NamedTuple):
 
 CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
-UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
-"""The distribution of the error of an unknown normal. Its confidence is 0."""
+UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))  # of an unknown normal, whose confidence is 0
 
 
 def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:

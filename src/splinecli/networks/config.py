@@ -20,12 +20,8 @@ from splinecli.records import settings
 HEAD_WIDTH = 16  # channels of an attention head of the set branch
 
 
-def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
-    return weighted_least_squares(observations, light_directions, valid.to(observations.dtype))[0]
-
-
 STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "ls": _least_squares,
+    "ls": lambda observed, lights, valid: weighted_least_squares(observed, lights, valid.to(observed.dtype))[0],
     "iw12": solve_iw12,
     "iw12-all": partial(solve_iw12, shadow_share=0),
     "ia14": solve_ia14,

@@ -8,9 +8,6 @@ from torch.nn.functional import normalize, softplus
 
 SIDE = 48  # height and width of the input images
 INPUTS = 4
-_WIDTHS = 24, 48, 96, 128
-_JOINED = 64
-_HIDDEN = 192
 
 
 class LightGuess(NamedTuple):
@@ -30,20 +27,20 @@ class LightNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        fine, local, middle, coarse = _WIDTHS
+        fine, local, middle, coarse, joined, hidden = 24, 48, 96, 128, 64, 192
         self.enter = nn.Conv2d(INPUTS, fine, 4, stride=2, padding=1)
         self.local = nn.ModuleList(
             (nn.Conv2d(fine, local, 3, stride=2, padding=1), nn.Conv2d(local, local, 3, padding=1))
         )
-        self.join1 = nn.Conv2d(3 * local, _JOINED, 1)
+        self.join1 = nn.Conv2d(3 * local, joined, 1)
         self.middle = nn.ModuleList(
-            (nn.Conv2d(_JOINED, middle, 3, stride=2, padding=1), nn.Conv2d(middle, middle, 3, padding=1))
+            (nn.Conv2d(joined, middle, 3, stride=2, padding=1), nn.Conv2d(middle, middle, 3, padding=1))
         )
         self.join2 = nn.Conv2d(3 * middle, coarse, 1)
         self.coarse = nn.Conv2d(coarse, coarse, 3, stride=2, padding=1)
-        self.flat = nn.Linear(coarse * (SIDE // 16) ** 2, _HIDDEN)
-        self.join3 = nn.Linear(3 * _HIDDEN, _HIDDEN)
-        self.out = nn.Linear(_HIDDEN, 6)
+        self.flat = nn.Linear(coarse * (SIDE // 16) ** 2, hidden)
+        self.join3 = nn.Linear(3 * hidden, hidden)
+        self.out = nn.Linear(hidden, 6)
 
     def forward(self, images: Tensor) -> LightGuess:
         """Estimate the lights of images (B, F, INPUTS, SIDE, SIDE); see network_inputs."""

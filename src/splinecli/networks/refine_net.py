@@ -34,8 +34,6 @@ FEATURE_WIDTHS = {
 }
 """The features and their numbers of channels. The first two channels of a vector are x and y."""
 
-_VECTORS = ("normal", "robust", "plain", "unexplained_light", "mean_light", "halves")
-
 
 def channels(name: str) -> slice:
     """Return the slice of a feature's channels."""
@@ -46,8 +44,11 @@ def channels(name: str) -> slice:
 
 CHANNELS = sum(FEATURE_WIDTHS.values())
 READ = channels("noise").start  # number of channels read by the net
-VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VECTORS)
-"""Channels with the x and y components of vectors, which rotate with the image."""
+# Channels with the x and y components of vectors, which rotate with the image.
+VECTORS = tuple(
+    (channels(name).start, channels(name).start + 1)
+    for name in ("normal", "robust", "plain", "unexplained_light", "mean_light", "halves")
+)
 
 _FIRST = channels("light_moments").start
 TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)  # channels with the xx, yy and xy components of a tensor
@@ -79,11 +80,7 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
 
 
 WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resolution
-ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks at each scale of the encoder
 SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of smoothed normals, which the net weights against the estimated normal
-
-# Limits of the log median error in radians, for the smoothing weights.
-_LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
 COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
 Part = tuple[slice, slice]  # rows and columns of a map
 
@@ -97,12 +94,9 @@ class RefineNet(nn.Module):
     After each layer, everything outside the mask is set to zero. Pixels outside the mask are therefore equivalent to
     pixels outside the image, so tiles with an overlap of `reach` give the same result as the whole image.
 
-    Args:
-        twice: whether a second such net, `again`, corrects the result. It reads the same features as the first, with
-            the normals and errors replaced by the first net's results.
-
-    Attributes:
-        reach: distance in pixels beyond which other pixels do not affect a result.
+    `twice` adds a second such net, `again`, which corrects the result. It reads the same features as the first, with
+    the normals and errors replaced by the first net's results. `reach` is the distance in pixels beyond which other
+    pixels do not affect a result.
     """
 
     def __init__(self, *, twice: bool = False) -> None:
@@ -112,7 +106,7 @@ class RefineNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
-            for width, count in zip(WIDTHS, ENCODING_BLOCKS, strict=True)
+            for width, count in zip(WIDTHS, (1, 2, 3, 2), strict=True)  # in the encoder
         )
         self.decode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
@@ -148,7 +142,10 @@ class RefineNet(nn.Module):
         for _ in self.down:
             masks.append(max_pool2d(masks[-1], 2))
         normals, error = (part.contiguous() for part in split_features(features))
-        towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
+        # Weight normals by their certainty, the inverse of the median error, whose logarithm is given.
+        weight = (-error[:, :1].clamp(-6.0, 1.0)).exp() * mask
+        smoothed = (unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS)
+        towards = [smooth - normals for smooth in smoothed]
         # In place if possible, because a tile's maps of 32 channels determine the memory required.
         read = features[:, :READ], *towards, mask
         x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
@@ -211,13 +208,6 @@ def unit_maps(vectors: Tensor) -> Tensor:
     x, y, z = torch.split(vectors, 1, dim=-3)
     length = (x * x + y * y + z * z).clamp(min=1e-24).sqrt()
     return vectors / length
-
-
-def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
-    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask."""
-    # Weight normals by their certainty, the inverse of the median error, whose logarithm is given.
-    weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
-    return [unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS]
 
 
 def reach_of(sigma: float) -> int:

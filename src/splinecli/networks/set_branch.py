@@ -20,9 +20,6 @@ from splinecli.networks.li_ne_net import zeroed
 
 SAMPLE = 256  # number of pixels of a capture that all its pixels attend to
 
-_DARK_SHARE = 0.02  # see lit_values. Darker pixels, such as a black background, carry no information
-_LARGEST_LOG = 7.0  # largest logarithm of a pixel's brightness relative to its capture
-
 
 class Summary(NamedTuple):
     """The summary of G captures in one layer, from S pixels of each."""
@@ -44,7 +41,7 @@ def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
 
     These are at most SAMPLE lit pixels, evenly spaced. If no pixel is lit, the first one is used.
     """
-    pixels, _ = lit_values(observations, _DARK_SHARE, SAMPLE)
+    pixels, _ = lit_values(observations, 0.02, SAMPLE)  # a black background carries no information
     return pixels if len(pixels) else np.zeros(1, np.intp)
 
 
@@ -54,7 +51,7 @@ def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
     Pixel p belongs to capture p % G.
     """
     levels = largest.view(-1, len(brightness)) / brightness.clamp(min=1e-9)
-    return levels.clamp(min=1e-9).log().clamp(-_LARGEST_LOG, _LARGEST_LOG).view(-1, 1)
+    return levels.clamp(min=1e-9).log().clamp(-7.0, 7.0).view(-1, 1)
 
 
 class ContextLayer(nn.Module):
@@ -75,11 +72,8 @@ class ContextLayer(nn.Module):
     def forward(self, tokens: Tensor, level: Tensor, captures: int, known: Summary | None) -> tuple[Tensor, Summary]:
         """Return the updated tokens (P, width), and the summary of their captures.
 
-        Args:
-            tokens: (P, width).
-            level: (P, 1), see brightness_level.
-            captures: the number G of captures. Pixel p belongs to capture p % G.
-            known: the summary of one capture; None to use the pixels themselves as the samples of their captures.
+        For the level (P, 1), see brightness_level. Pixel p belongs to capture p % `captures`. `known` is the summary of
+        one capture; None uses the pixels themselves as the samples of their captures.
         """
         embedded = self.embed(torch.cat((tokens, level), dim=1)).view(-1, captures, tokens.shape[1]).transpose(0, 1)
         summary = self._summarise(embedded) if known is None else known

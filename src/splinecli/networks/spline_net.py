@@ -18,8 +18,6 @@ from splinecli.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet,
 from splinecli.networks.refine_net import RefineNet
 from splinecli.networks.set_branch import CaptureContext, SetBranch
 
-RESIDUAL_LIMIT = 3.0
-
 
 class Rotation(NamedTuple):
     """A rotation of the lights about the view axis, and a reflection."""
@@ -123,7 +121,7 @@ class SplineNet(nn.Module):
             lights, scaled_normals, fitted = lights * flip, scaled_normals * flip, fitted * flip
         albedo = scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-3)
         predicted = (lights @ scaled_normals[..., None])[..., 0]
-        residual = ((observed - predicted) / albedo).clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+        residual = ((observed - predicted) / albedo).clamp(-3.0, 3.0)
         side, grid = self.config.map_size, self.config.grid
         stacked = torch.stack((observed, residual), dim=-1)
         maps = sparse_map(stacked, lights, valid, size=side, grid=grid)
@@ -216,10 +214,7 @@ class SplineNet(nn.Module):
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
         assert self.set_branch is not None
         inputs = maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
-        found: tuple[Tensor, Tensor, CaptureContext | None] = self.set_branch(
-            *inputs, captures=captures, context=context
-        )
-        return found
+        return self.set_branch(*inputs, captures=captures, context=context)  # type: ignore[no-any-return]
 
 
 def _starting_normals(maps: PixelMaps) -> Tensor:

@@ -16,6 +16,7 @@ Their normals are assumed to be in our frame: x right, y up, z to the camera.
 
 import hashlib
 import json
+import os
 import pickletools
 import warnings
 import zipfile
@@ -41,9 +42,7 @@ from splinecli.system.files import check_file, expanded, file_sha256, is_special
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
 LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
-LONGEST = 500_000_000
-"""Largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB."""
-
+LONGEST = 500_000_000  # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
 _LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -91,10 +90,8 @@ def save_weights(network: SplineNet, path: Path) -> None:
 
 def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
     """Write the parameters of a module as float16, with metadata and their checksum. Raises OutputError."""
-    tensors = {
-        name: tensor.detach().cpu().half().clone(memory_format=torch.contiguous_format)
-        for name, tensor in module.state_dict().items()
-    }
+    half = {name: tensor.detach().cpu().half() for name, tensor in module.state_dict().items()}
+    tensors = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()}
     write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
 
 
@@ -198,19 +195,13 @@ def untrained_warning(sha256: str, n_lights: int) -> list[str]:
     return []
 
 
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # the name is too long for a file name
-        return False
-
-
 def resolve_weights(name_or_file: str) -> LoadedNetwork:
     """Load shipped weights by name, or a weight file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
         path = expanded(name_or_file)
-        if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
+        # os.path is false for names that are too long for a file, where Path raises.
+        if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
             raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
         return load_weights(path)
@@ -262,9 +253,8 @@ _NE_NET_MODULES = {
     "hidden": "dense.0",
     "out": "dense.1",
 }
-_MOST_NAMES = 5
+# Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000.
 _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
-"""Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000."""
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
@@ -277,7 +267,9 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
     tensors = _flip_rows(_read_li_net(li_net_file, network.li_net), "li_net.")
-    ne_net = _read_ne_net(ne_net_file, network.ne_net)
+    parts = (name.rpartition(".") for name in network.ne_net.state_dict())
+    names = {f"{module}.{kind}": f"{_NE_NET_MODULES[module]}.{kind}" for module, _, kind in parts}
+    ne_net = _rename(ne_net_file, network.ne_net, names, {})
     side = network.config.map_size // 2
     hidden = ne_net["hidden.weight"]
     ne_net["hidden.weight"] = hidden.reshape(len(hidden), -1, side, side).flip(2).flatten(1)
@@ -302,21 +294,12 @@ def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
         if kind == "weight" and tensor.ndim == 1:
             tracked |= {f"{norm}.running_mean": tensor.shape, f"{norm}.running_var": tensor.shape}
             tracked[f"{norm}.num_batches_tracked"] = torch.Size([])
-    return _rename(path, _read_state(path), li_net, names, tracked)
+    return _rename(path, li_net, names, tracked)
 
 
-def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
-    names = {}
-    for name in ne_net.state_dict():
-        module, _, parameter = name.rpartition(".")
-        names[name] = f"{_NE_NET_MODULES[module]}.{parameter}"
-    return _rename(path, _read_state(path), ne_net, names, {})
-
-
-def _rename(
-    path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
-) -> dict[str, Tensor]:
+def _rename(path: Path, network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]) -> dict[str, Tensor]:
     """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists unused shapes."""
+    state = _read_state(path)
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
     missing = [name for name in shapes if name not in state]
@@ -358,14 +341,13 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     except Exception as error:  # damaged pickles raise many types of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor) for name, tensor in state.items()
+        isinstance(name, str)
+        and isinstance(tensor, Tensor)
+        and (tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized)
+        for name, tensor in state.items()
     ):
         raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
     return state
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    return tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
 
 
 def _check_content(path: Path) -> None:
@@ -395,5 +377,5 @@ def _check_content(path: Path) -> None:
 
 def _listed(names: Iterable[str]) -> str:
     quoted = [repr(name) for name in names]
-    more = len(quoted) - _MOST_NAMES
-    return ", ".join(quoted[:_MOST_NAMES]) + (f" and {more} more tensors" if more > 0 else "")
+    more = len(quoted) - 5
+    return ", ".join(quoted[:5]) + (f" and {more} more tensors" if more > 0 else "")

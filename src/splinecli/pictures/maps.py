@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
 
 
-_HEAD = 33  # bytes of the signature and of the header, which is the first chunk of a file
-
-
 def encode_png(
     picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | None = None, *, film: bool = False
 ) -> bytes:
@@ -42,13 +39,11 @@ def encode_png(
     chunks = [b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
     whole = [struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks]
-    return file[:_HEAD] + b"".join(whole) + file[_HEAD:]
+    return file[:33] + b"".join(whole) + file[33:]  # behind the header, which is the first chunk of a file
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-
 TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
-
 TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) for third in range(4)}
 TITLE = "angular error (deg)"
 
@@ -58,7 +53,6 @@ def albedo_picture(albedo: Float32Array, mask: Bools) -> Picture:
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
     """
-    # The brightest 1 % are white.
     white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
 
@@ -69,10 +63,7 @@ def confidence_picture(confidence_map: Float32Array, _: Bools | None = None) -> 
 
 
 def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
-    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
-
-    It is black outside the mask (H, W).
-    """
+    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT, black outside the mask."""
     shading = (normal_map @ unit(np.array(PREVIEW_LIGHT, np.float32))) * mask
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
@@ -103,7 +94,6 @@ def bounding_box(mask: Bools) -> tuple[slice, slice]:
 
 
 MOST_SCENES = 120
-_LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
 
 
 def contact_sheet(pixel_set: PixelSet) -> Picture:
@@ -128,7 +118,7 @@ def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
     first = pixel_set.load(entries[0])
     tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8), tile)]
     for pixels in map(pixel_set.load, entries):
-        for light in _LIGHTS:
+        for light in ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63)):
             # The image under the closest light, scaled so that its 98th percentile is white.
             closest = int(np.argmax(pixels.light_directions @ np.array(light)))
             values = np.asarray(pixels.observations[:, closest], np.float32)

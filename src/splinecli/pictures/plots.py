@@ -57,9 +57,6 @@ def png_bytes(figure: Figure, dpi: int) -> bytes:
     return buffer.getvalue()
 
 
-_RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
-
-
 def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64Array | None = None) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
@@ -71,14 +68,19 @@ def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64A
     figure = Figure(figsize=(6, 6), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     angle = np.linspace(0, 2 * np.pi, 361)
-    for ring_deg in (*_RINGS_DEG, 90):
+    for ring_deg in (15, 30, 45, 60, 75, 90):
         radius = np.sin(np.radians(ring_deg))
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1)
         if ring_deg < 90:  # the labels of 90 and 75 degrees would overlap
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
-    for outline in [] if errors_deg is None else _circles(light_directions, np.radians(errors_deg), angle):
-        axes.plot(*outline.T, color="#D55E00", alpha=0.4, linewidth=1, zorder=2)
+    if errors_deg is not None:  # circles on the sphere around the directions
+        radii = np.radians(errors_deg)[:, None, None]
+        across = unit(np.cross(light_directions, np.eye(3)[np.abs(light_directions).argmin(axis=1)]))
+        turned = np.cross(light_directions, across)
+        around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
+        for outline in light_directions[:, None] * np.cos(radii) + around * np.sin(radii):
+            axes.plot(*outline[:, :2].T, color="#D55E00", alpha=0.4, linewidth=1, zorder=2)
     axes.scatter(x, y, s=30, color="#D55E00", zorder=3)
     for number, place in enumerate(zip(x, y, strict=True), start=1):
         axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3)
@@ -87,17 +89,7 @@ def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64A
     return png_bytes(figure, 120)
 
 
-def _circles(directions: Float64Array, radii: Float64Array, angle: Float64Array) -> Float64Array:
-    """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
-    across = unit(np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)]))
-    turned = np.cross(directions, across)
-    around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
-    cosine, sine = np.cos(radii)[:, None, None], np.sin(radii)[:, None, None]
-    return np.asarray((directions[:, None] * cosine + around * sine)[..., :2])
-
-
-_MAP_INCHES = 1.7
-_SMALL, _LARGE = 8, 9  # points
+_SMALL = 8  # points
 
 
 def observation_map_figure(
@@ -127,18 +119,28 @@ def observation_map_figure(
         grid: how light directions are assigned to cells.
     """
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
     labelled = {"sparse map": sparse, "LI-Net's dense map": dense, truth_label: truth}
     columns = {label: maps for label, maps in labelled.items() if maps is not None}
-    size = (_MAP_INCHES * len(columns) + 0.8, (_MAP_INCHES + 0.25) * len(sparse) + 0.7)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(1.7 * len(columns) + 0.8, (1.7 + 0.25) * len(sparse) + 0.7), layout="constrained")
     if title:
-        figure.suptitle(title, fontsize=_LARGE, parse_math=False)
+        figure.suptitle(title, fontsize=9, parse_math=False)
+    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
+    # represent a single line each.
+    size = sparse.shape[1]
+    centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
+    if grid == "cnn-ps":
+        centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
     axes = figure.subplots(len(sparse), len(columns), squeeze=False)
     for place, (name, maps) in enumerate(columns.items()):
         for axis, values in zip(axes[:, place], maps, strict=True):
             image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
-            _finish(axis, len(values), grid)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_facecolor("0.85")  # light gray, which the colour scale does not contain
+            circle = Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False)
+            axis.add_patch(circle)
         axes[-1, place].set_xlabel(name, fontsize=_SMALL)
     places = [""] * len(sparse) if pixels is None else [f"row {row}, column {col}: " for row, col in pixels]
     for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
@@ -147,20 +149,6 @@ def observation_map_figure(
     bar.set_label("relative to the largest observation", fontsize=_SMALL)
     bar.ax.tick_params(labelsize=_SMALL)
     return png_bytes(figure, 150)
-
-
-def _finish(axes: Axes, size: int, grid: Grid) -> None:
-    from matplotlib.patches import Circle
-
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_facecolor("0.85")  # light gray, which the colour scale does not contain
-    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
-    # represent a single line each.
-    centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
-    if grid == "cnn-ps":
-        centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
-    axes.add_patch(Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False))
 
 
 Columns = Mapping[str, Sequence[float | None]]
@@ -186,7 +174,15 @@ def training_figure(columns: Columns) -> Figure:
     _plot(maps, columns, "map_error", "all cells")
     _plot(maps, columns, "masked_map_error", "cells with a light")
     for axes in (loss, angle, maps):
-        _finish_curves(axes)
+        axes.set_visible(bool(axes.lines))
+        if not axes.lines:
+            continue
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.3)
+        axes.legend()
+        values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
+        if (values > 0).all() and values.max() > 20 * values.min():  # An axis whose values span more is logarithmic.
+            axes.set_yscale("log")
     return figure
 
 
@@ -197,22 +193,7 @@ def _plot(axes: Axes, columns: Columns, name: str, label: str, *, style: str = "
         axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
 
 
-def _finish_curves(axes: Axes) -> None:
-    """Add the grid, the legend and the scale, or hide axes without a curve."""
-    axes.set_visible(bool(axes.lines))
-    if not axes.lines:
-        return
-    axes.set_xlabel("step")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-    if (values > 0).all() and values.max() > 20 * values.min():  # An axis whose values span more is logarithmic.
-        axes.set_yscale("log")
-
-
-_MOST_WIDE = 3600  # pixels, all columns without gaps: the picture stays below 4000
 _MAPS_DPI = 100
-_POINT = _MAPS_DPI / 72  # pixels
 
 
 def method_maps(
@@ -347,7 +328,7 @@ def _write(
     """Write text centred at (x, y) in pixels from the bottom left."""
     from matplotlib.transforms import IdentityTransform
 
-    size, in_pixels = height / _POINT, IdentityTransform()
+    size, in_pixels = height / (_MAPS_DPI / 72), IdentityTransform()
     figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
 
 
@@ -359,7 +340,8 @@ def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
 
 def _scale(height: int, width: int, columns: int) -> float:
     """Return the factor of enlargement: a whole number, or less than 1."""
-    most = min(_MOST_WIDE / columns / width, 1200 / height)  # a map has at most 1200 rows
+    # All columns without gaps are 3600 pixels wide at most, so the picture stays below 4000. A map has up to 1200 rows.
+    most = min(3600 / columns / width, 1200 / height)
     # Small maps are enlarged while their longer side stays within 240 pixels.
     return most if most < 1 else max(1, min(int(most), 240 // max(height, width)))
 

@@ -23,14 +23,7 @@ from splinecli.methods import Estimator, MethodOptions, method_names
 from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import (
-    BASE_BYTES,
-    held_results,
-    infer_capture,
-    inputs_sha256,
-    make_method,
-    source_bytes,
-)
+from splinecli.pipeline.infer import BASE_BYTES, held_results, infer_capture, inputs_sha256, make_method, source_bytes
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
@@ -69,10 +62,8 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )
+            problem = f"{other} and {folder} have the same name, so their results would overwrite each other"
+            raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]
 
 
@@ -97,9 +88,8 @@ def _batch_item(folder: Path) -> BatchItem:
         except InputError:
             return BatchItem(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
-        raise UsageError(
-            "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
-        )
+        hint = "Write lists with commas, such as --maps albedo,confidence"
+        raise UsageError("the folder does not exist", path=folder, hint=hint)
     kind = "film" if is_film(folder) else "folder"
     return BatchItem(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
 
@@ -109,10 +99,8 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture."""
+    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and were kept."""
 
-    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (the folder does
-    # not exist) or failed
     status: Status
     report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
     exit_code: int = 0
@@ -159,10 +147,8 @@ def _failure(member: BatchItem, error: Exception) -> Outcome:
         error = as_splinecli_error(error, member.folder)
     elif not isinstance(error, SplinecliError):
         trace = "".join(traceback.format_exception(error))
-        error = SplinecliError(
-            f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
-            hint="Please report it with the lines above",
-        )
+        problem = f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli"
+        error = SplinecliError(problem, hint="Please report it with the lines above")
     if isinstance(error, NoRoomError):
         raise error
     return failed(member.name, error, trace)
@@ -177,22 +163,15 @@ def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status 
 class ChangedError(OutputError):
     """A folder has results of other input files, other options or another version."""
 
-    def __init__(self, made: str, folder: Path) -> None:
-        hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
-        super().__init__(f"contains results made {made}", path=folder, hint=hint)
-
 
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results match the capture in `folder` and the options.
+    """Return the report in `target` if its results match the capture in `folder` and the options; None without results.
 
-    Returns None if no results exist. If an interrupted run left partial results, `warn` receives a sentence about this.
-
-    Raises:
-        ChangedError: the results belong to another capture or other options.
-        InputError: the capture cannot be read.
-        OutputError: `target` is also the capture's folder, where the user's own files may have the names of results.
+    If an interrupted run left partial results, `warn` receives a sentence about this. Raises ChangedError for results
+    of another capture or other options, InputError, or OutputError if `target` is also the capture's folder, where the
+    user's own files may have the names of results.
     """
     try:
         report = read_report(target)
@@ -205,23 +184,23 @@ def find_earlier(
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            raise OutputError(
-                f"contains {found}, but no {REPORT}, and is the folder of the capture",
-                path=target,
-                hint="Add --overwrite, or choose another place with -o",
-            ) from None
+            problem, hint = f"contains {found}, but no {REPORT}, and is the folder of the capture", "Add --overwrite"
+            raise OutputError(problem, path=target, hint=f"{hint}, or choose another place with -o") from None
         warn(f"{target}: {error}, so it is computed again")
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
-        raise ChangedError("by another version", target) from None
-    if version != __version__:
-        raise ChangedError(f"by version {version}", target)
-    if names := options.changes(earlier):
-        differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
-        raise ChangedError(f"with {differences}", target)
-    if stamp != inputs_sha256(options.open(folder), options.weights):
-        raise ChangedError("from other input files", target)
-    return report
+        made = "by another version"
+    else:
+        if version != __version__:
+            made = f"by version {version}"
+        elif names := options.changes(earlier):
+            made = f"with another {names[0]}" if len(names) == 1 else f"with other options ({', '.join(names)})"
+        elif stamp != inputs_sha256(options.open(folder), options.weights):
+            made = "from other input files"
+        else:
+            return report
+    hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
+    raise ChangedError(f"contains results made {made}", path=target, hint=hint)
 
 
 def infer_batch(
@@ -240,14 +219,11 @@ def infer_batch(
     Args:
         folders: the captures. Duplicates are ignored.
         redo: which captures with existing results are computed again.
-        cluster: the processes or machines to run on. With 0 workers, as many are started as the machine's cores and
-            memory allow.
+        cluster: the processes or machines to run on. 0 workers are as many as the machine's cores and memory allow.
 
     Raises:
-        UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
-            exist is the name of a map, format or method.
-        InputError: a file that the options name does not exist.
-        ModelError: the weights cannot be used.
+        UsageError: see list_captures, or the options do not fit the method.
+        InputError, ModelError: a file that the options name does not exist, or the weights cannot be used.
         OutputError: the output folder cannot be written, or the disk is full. If only the folder of one capture cannot
             be written, that capture fails and the batch continues.
         SplinecliError: the connection to a Dask scheduler was lost.
@@ -262,13 +238,12 @@ def infer_batch(
     entries: dict[int, Entry] = {}
     if cluster.address is None and not cluster.workers:
         cluster = cluster.replace(workers=choose_workers(members, options))
-    elsewhere = cluster.on_cores(len(members))
     outcomes: Iterable[tuple[int, Outcome]]
-    if elsewhere is None:
+    if elsewhere := cluster.on_cores(len(members)):
+        outcomes = _on_workers(members, options, observer, redo, elsewhere)
+    else:
         method = cache(partial(make_method, options))
         outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
-    else:
-        outcomes = _on_workers(members, options, observer, redo, elsewhere)
     for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
@@ -287,10 +262,7 @@ def _on_workers(
     # Accept any device, because the workers may have GPUs that the command's machine does not have.
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
-    items = (
-        Item((number, member), str(member.folder), expected_bytes(member, options))
-        for number, member in enumerate(members)
-    )
+    items = (Item((n, each), str(each.folder), expected_bytes(each, options)) for n, each in enumerate(members))
     with (
         distributor(infer, Path(options.output), cluster, observer) as workers,
         observer.progress("captures", len(members), unit="captures") as advance,
@@ -303,11 +275,9 @@ def _on_workers(
                 observer.warn(warning)
             n_failed += outcome.exit_code != 0
             n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
-            advance(
-                1,
-                f"{n_ended - n_failed} done, {n_failed} failed, {len(workers.running)} running,"
-                f" {n_pixels / (time.monotonic() - began):,.0f} pixels/s",
-            )
+            speed = n_pixels / (time.monotonic() - began)
+            done = f"{n_ended - n_failed} done, {n_failed} failed, {len(workers.running)} running"
+            advance(1, f"{done}, {speed:,.0f} pixels/s")
             yield number, outcome
 
 
@@ -324,7 +294,6 @@ class _Warnings(Observer):
 def _infer(
     options: InferOptions, redo: Redo, sha256: str | None, number: int, member: BatchItem
 ) -> tuple[Outcome, list[str]]:
-    """Compute a capture on a worker, and return its outcome and the warnings."""
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
@@ -340,11 +309,9 @@ def _method(options: InferOptions, method: MethodOptions, sha256: str | None) ->
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
-        raise ModelError(
-            f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
-            path=options.weights,
-            hint="Use the same file, and the same version of splinecli, everywhere",
-        )
+        problem = f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command"
+        hint = "Use the same file, and the same version of splinecli, everywhere"
+        raise ModelError(problem, path=options.weights, hint=hint)
     return estimator
 
 

@@ -31,70 +31,63 @@ OUTPUT_FILES = (DIRECTIONS, INTENSITIES, CROSSTALK, POSITIONS, PIXEL_SIZE, CAMER
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Calibrate the lights, write OUTPUT_FILES and return the report.
-
-    Raises InputError if an image or file cannot be used, or the numbers of images and lights differ, or OutputError if
-    the results exist and `overwrite` is not set, or they cannot be written.
-    """
+    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError, OutputError."""
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
-        return _calibrate_into(options, observer)
-
-
-def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, Any]:
-    """Run calibrate_lights in the folder of results, which the caller has locked."""
-    target = options.gray_ball or options.gray_card
-    # Report a wrong path now, not only after all images have been read.
-    target_files = None if target is None else find_ball_files(target)
-    balls = [
-        find_ball_files(folder, mask=mask)
-        for folder, mask in zip(options.balls, options.masks or [None] * len(options.balls), strict=True)
-    ]
-    known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
-    circles = [Circle(*numbers) for numbers in options.circles] if options.circles else [None] * len(balls)
-    with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
-        calibrated = [
-            calibrate_ball(ball, circle=circle, camera_matrix=options.camera_matrix, progress=lambda: advance(1))
-            for ball, circle in zip(balls, circles, strict=True)
+        target = options.gray_ball or options.gray_card
+        # Report a wrong path now, not only after all images have been read.
+        target_files = None if target is None else find_ball_files(target)
+        balls = [
+            find_ball_files(folder, mask=mask)
+            for folder, mask in zip(options.balls, options.masks or [None] * len(options.balls), strict=True)
         ]
-    lights = combine_balls(calibrated)
-    intensities = crosstalk = None
-    warnings: list[str] = []
-    if target_files is not None:
-        radiometry = RadiometricCalibration(parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC)
-        radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
-        warnings = [f"{target}: {warning}" for warning in of_curve]
-        if options.lights_in_channels:
-            crosstalk = measure_crosstalk(target_files, lights.directions, radiometry=radiometry)
-        else:
+        known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
+        circles = [Circle(*numbers) for numbers in options.circles] if options.circles else [None] * len(balls)
+        with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
+            calibrated = [
+                calibrate_ball(ball, circle=circle, camera_matrix=options.camera_matrix, progress=lambda: advance(1))
+                for ball, circle in zip(balls, circles, strict=True)
+            ]
+        lights = combine_balls(calibrated)
+        intensities = crosstalk = None
+        warnings: list[str] = []
+        if target_files is not None:
+            radiometry = RadiometricCalibration(
+                parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC
+            )
+            radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
+            warnings += [f"{target}: {warning}" for warning in of_curve]
             shape: Target = "ball" if options.gray_ball is not None else "card"
-            intensities = measure_light_intensities(target_files, lights.directions, shape, radiometry=radiometry)
-    lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
-    report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
-    report["warnings"] += warnings
-    report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
-    texts = {DIRECTIONS: rows_text(lights.directions), REPORT: json.dumps(report, indent=2) + "\n"}
-    if intensities is not None:
-        texts[INTENSITIES] = rows_text(intensities)
-    if crosstalk is not None:
-        texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
-    if lamps is not None and lamps.known:
-        texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
-        if lamps.view.known:
-            texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
-    # Remove files that this run does not overwrite, because they belong to earlier lights.
-    with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
-        for name, text in texts.items():
-            new.write(name, text)
-        new.write(PICTURE, calibration_picture(lights.balls))
-    for line in summary_lines(report):
-        observer.say(line)
-    if intensities is not None:
-        observer.say(f"The light intensities are in {options.output / INTENSITIES}")
-    if crosstalk is not None:
-        observer.say(f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels")
-    if lamps is not None and lamps.known:
-        observer.say(f"The positions of the lamps are in {options.output / POSITIONS}, for --light-positions")
-    for warning in report["warnings"]:
-        observer.warn(warning)
-    return report
+            if options.lights_in_channels:
+                crosstalk = measure_crosstalk(target_files, lights.directions, radiometry=radiometry)
+            else:
+                intensities = measure_light_intensities(target_files, lights.directions, shape, radiometry=radiometry)
+        lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
+        report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
+        report["warnings"] += warnings
+        report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
+        texts = {DIRECTIONS: rows_text(lights.directions), REPORT: json.dumps(report, indent=2) + "\n"}
+        if intensities is not None:
+            texts[INTENSITIES] = rows_text(intensities)
+        if crosstalk is not None:
+            texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
+        if lamps is not None and lamps.known:
+            texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
+            if lamps.view.known:
+                texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
+        # Remove files that this run does not overwrite, because they belong to earlier lights.
+        with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
+            for name, text in texts.items():
+                new.write(name, text)
+            new.write(PICTURE, calibration_picture(lights.balls))
+        for line in summary_lines(report):
+            observer.say(line)
+        if intensities is not None:
+            observer.say(f"The light intensities are in {options.output / INTENSITIES}")
+        if crosstalk is not None:
+            observer.say(f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels")
+        if lamps is not None and lamps.known:
+            observer.say(f"The positions of the lamps are in {options.output / POSITIONS}, for --light-positions")
+        for warning in report["warnings"]:
+            observer.warn(warning)
+        return report

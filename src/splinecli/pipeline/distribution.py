@@ -33,24 +33,11 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-_CONNECT_SECONDS = 5.0
-_ANSWER_SECONDS = 6.0  # time limit for a server to answer as a scheduler
-_CLOSE_SECONDS = 5.0
-_LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
-
-# A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
-_IGNORE_INTERRUPTS = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
-
-_QUIET = {
-    "distributed.admin.low-level-log-length": 100,
-    "distributed.admin.system-monitor.log-length": 10,
-    "distributed.admin.system-monitor.interval": "10s",
-    "distributed.admin.tick.interval": "1s",
-    "distributed.scheduler.active-memory-manager.start": False,
-    "distributed.scheduler.work-stealing": False,
-    "distributed.worker.profile.enabled": False,
-}
-"""Dask settings that disable the collection of dashboard data, which costs processor time and an hour of memory."""
+_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = 5.0, 6.0, 5.0  # a server has to answer as a scheduler
+_LOOK_SECONDS = 0.5  # between two updates of the list of workers
+_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
+SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
+SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 
 @contextmanager
@@ -90,10 +77,8 @@ def _client(address: str) -> Client:
             raise ValueError(f"a {identity['type']} answers at {address}")
         return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
     except Exception as error:
-        raise UsageError(
-            f"no Dask scheduler answers at {address}",
-            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
-        ) from error
+        hint = "Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'"
+        raise UsageError(f"no Dask scheduler answers at {address}", hint=hint) from error
 
 
 @contextmanager
@@ -107,13 +92,22 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
+    loggers = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
-        **_QUIET,
+        # No data for a dashboard, which cost processor time and an hour of memory
+        "distributed.admin.low-level-log-length": 100,
+        "distributed.admin.system-monitor.log-length": 10,
+        "distributed.admin.system-monitor.interval": "10s",
+        "distributed.admin.tick.interval": "1s",
+        "distributed.scheduler.active-memory-manager.start": False,
+        "distributed.scheduler.work-stealing": False,
+        "distributed.worker.profile.enabled": False,
         # If a worker is lost, its item is retried twice. A running cluster has its own setting.
         "distributed.scheduler.allowed-failures": 2,
-        "distributed.worker.preload": [_IGNORE_INTERRUPTS],
-        "logging": dict.fromkeys(_LOGGERS, "critical"),
+        # A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
+        "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"],
+        "logging": dict.fromkeys(loggers, "critical"),
         # On a busy machine, a restarted worker may need more time than Dask allows by default.
         "distributed.deploy.lost-worker-timeout": "1 h",
     }
@@ -133,10 +127,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
             reason = "" if cause is None else f" ({cause.strerror or cause})"
-            raise SplinecliError(
-                f"the processes of --workers cannot be started{reason}",
-                hint="Leave --workers out, or raise the limits: each needs a temporary folder and 50 open files",
-            ) from error
+            problem = f"the processes of --workers cannot be started{reason}"
+            hint = "Leave --workers out, or raise the limits: each needs a temporary folder and 50 open files"
+            raise SplinecliError(problem, hint=hint) from error
         try:
             yield cluster
         finally:
@@ -153,18 +146,8 @@ def _address(text: str) -> str:
     try:
         return str(read_json(Path(text))["address"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(
-            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a scheduler file",
-            hint="'dask scheduler --scheduler-file FILE' writes such a file",
-        ) from None
-
-
-SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
-SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
-
-_LOOK_SECONDS = 0.5  # between two updates of the list of workers
-
-_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
+        problem = f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a scheduler file"
+        raise UsageError(problem, hint="'dask scheduler --scheduler-file FILE' writes such a file") from None
 
 
 class LostError(SplinecliError):
@@ -188,11 +171,9 @@ def _versions() -> dict[str, str]:
 class Work:
     """The settings shared by all items of a command; they are sent with each item."""
 
-    # called with the arguments of an item; returns the result, or raises an error about the worker
-    do: Callable[..., Any]
+    do: Callable[..., Any]  # from the arguments of an item to the result; or raises an error about the worker
     probe: str  # a file in the output folder; a worker that cannot find it uses different storage
-    # the working folder of the command, against which relative paths are resolved
-    folder: str = field(default_factory=os.getcwd)
+    folder: str = field(default_factory=os.getcwd)  # of the command, against which relative paths are resolved
     versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:
@@ -203,9 +184,8 @@ class Work:
         try:
             os.chdir(self.folder)
         except OSError as error:
-            raise InputError(
-                f"the folder cannot be entered ({error.strerror})", path=self.folder, hint=SAME_STORAGE
-            ) from None
+            problem = f"the folder cannot be entered ({error.strerror})"
+            raise InputError(problem, path=self.folder, hint=SAME_STORAGE) from None
         deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
@@ -244,9 +224,7 @@ class Distributor:
     def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Any]]:
         """Yield each item with its result, or with a LostError, as it finishes.
 
-        Raises:
-            SplinecliError: an item failed, or a worker is unusable. The message names the worker.
-            SplinecliError: the scheduler was lost.
+        Raises SplinecliError, also if the scheduler was lost. The message names the worker.
         """
         # A worker without splinecli could not even unpickle an item.
         for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
@@ -263,23 +241,17 @@ class Distributor:
                 began = time.monotonic()
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
-                raise SplinecliError(
-                    "the workers end while they are getting ready",
-                    hint="If there is too little memory, use fewer. Dask's output says more",
-                )
+                hint = "If there is too little memory, use fewer. Dask's output says more"
+                raise SplinecliError("the workers stop while they start", hint=hint)
             while following is not None and len(self.running) < len(workers):
                 limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
                 largest = max(float(limit or math.inf) for limit in limits)
                 # The workers of a cluster have Dask's memory limits, whereas local workers share this machine's memory.
                 used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
                 if following.memory > largest:
-                    error = LostError(
-                        f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
-                        f" {largest / 1e9:.1f} GB",
-                        path=following.name,
-                        hint="Start fewer workers on each machine, with more memory each",
-                    )
-                    yield following, error
+                    problem = f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
+                    hint = "Start fewer workers on each machine, with more memory each"
+                    yield following, LostError(f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint)
                 elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:
@@ -300,10 +272,8 @@ class Distributor:
             return found
         with_gpu = {address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1}
         if found and not with_gpu and not self.running:
-            raise UsageError(
-                "no worker has the Dask resource GPU",
-                hint="Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'",
-            )
+            hint = "Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'"
+            raise UsageError("no worker has the Dask resource GPU", hint=hint)
         return with_gpu
 
     def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
@@ -333,11 +303,9 @@ class Distributor:
             return
         except KilledWorker as error:
             last = getattr(error.last_worker, "address", error.last_worker)
-            result = LostError(
-                f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
-                path=item.name,
-                hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
-            )
+            problem = f"its worker was lost {error.allowed_failures + 1} times, the last one {last}"
+            hint = "If there was too little memory, start fewer workers on each machine, or make the images smaller"
+            result = LostError(problem, path=item.name, hint=hint)
         del self.running[future]
         yield item, result
 
@@ -347,9 +315,8 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
 
 
 def _scheduler_lost() -> SplinecliError:
-    return SplinecliError(
-        "the connection to the Dask scheduler was lost", hint="Run the same command again. It skips what is done"
-    )
+    hint = "Run the same command again. It skips captures that are already done"
+    return SplinecliError("the connection to the Dask scheduler was lost", hint=hint)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -39,13 +39,8 @@ class EvaluateOutcome(NamedTuple):
 def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> EvaluateOutcome:
     """Score the methods on the captures, and write the results to the output folder.
 
-    All options are checked before the first image is read.
-
-    Raises:
-        UsageError: an option does not fit the captures or the methods.
-        InputError: no capture could be scored, or a folder or the draws file is wrong.
-        ModelError: weights cannot be used.
-        OutputError: the output folder cannot be written.
+    All options are checked before the first image is read. Raises UsageError, ModelError, OutputError, or InputError if
+    no capture could be scored, or a folder or the draws file is wrong.
     """
     captures = [capture for dataset in options.datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
@@ -121,9 +116,7 @@ def _score_on_workers(
 ) -> Iterator[tuple[DrawTask, Scored]]:
     """Yield the draws with their scores as they finish, one item per draw. Only this process writes to the store.
 
-    Raises:
-        LostError: the workers of a draw were lost. All other draws are still scored.
-        SplinecliError: an error from a trial or from Distributor.run.
+    Raises LostError if the workers of a draw were lost, after all others were scored; or see Distributor.run.
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
@@ -141,36 +134,35 @@ def _score_on_workers(
 
 
 def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
-    return _scorer(command, fingerprints, options).score(draw)
+    return _scorer(command, fingerprints, options)(draw)
 
 
 @lru_cache(maxsize=1)
-def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
-    """Return the scorer for the worker's current command; it is not reused, because files may change in between."""
-    return _Scorer(fingerprints, options)
+def _scorer(
+    _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions
+) -> Callable[[DrawTask], Scored]:
+    """Return the function that scores draws of the worker's current command, and keeps the last capture in memory.
 
+    It is not reused by other commands, because files may change in between.
+    """
+    estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
+    for name, expected in fingerprints:
+        if (found := estimators[name].fingerprint) != expected:
+            problem = f"{name} is {found} here, expected {expected} as on the machine of the command"
+            raise ModelError(problem, hint="Use the same weight file everywhere, and the same --precision")
+    last: tuple[CaptureReading, TrialSource, Notes] | None = None
 
-class _Scorer:
-    """Scores draws, and keeps the last capture in memory."""
-
-    def __init__(self, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
-        self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
-        for name, expected in fingerprints:
-            if (found := self._estimators[name].fingerprint) != expected:
-                raise ModelError(
-                    f"{name} is {found} here, expected {expected} as on the machine of the command",
-                    hint="Use the same weight file everywhere, and the same --precision",
-                )
-        self._last: tuple[CaptureReading, TrialSource, Notes] | None = None
-
-    def score(self, task: DrawTask) -> Scored:
-        if self._last is None or self._last[0] != task.reading:
-            self._last = None  # frees the memory
+    def score(task: DrawTask) -> Scored:
+        nonlocal last
+        if last is None or last[0] != task.reading:
+            last = None  # frees the memory
             reading = task.reading
             try:
-                self._last = reading, *reading.read(open_to_score(reading.folder, reading.protocols[0]))
+                last = reading, *reading.read(open_to_score(reading.folder, reading.protocols[0]))
             except (InputError, UsageError) as error:
                 return error
-        _, source, notes = self._last
+        _, source, notes = last
         shared = SharedDraw(source)
-        return [shared.score(trial, self._estimators[trial.method]) for trial in task.trials], notes
+        return [shared.score(trial, estimators[trial.method]) for trial in task.trials], notes
+
+    return score

@@ -5,6 +5,7 @@ import os
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,13 +26,9 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo) -> Path:
     """Return the capture; for a film, the folder in `output` with its frames, which are extracted if needed.
 
-    Args:
-        redo: whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
-
-    Raises:
-        UsageError: the options do not ask for the lights of a film to be estimated from its images.
-        InputError: the film cannot be read, or its light does not move.
-        OutputError: the folder contains frames from another film, or other files, or the frames cannot be written.
+    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
+    Raises UsageError without --lights estimate, InputError if the film cannot be read, or its light does not move, or
+    OutputError if the folder contains frames from another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
@@ -46,20 +43,15 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            raise OutputError(
-                f"contains {others[0]}, which is no frame of this film",
-                path=folder,
-                hint="Move it, or choose another -o",
-            )
+            problem = f"contains {others[0]}, which is not a frame of this film"
+            raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
         whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
-            raise OutputError(
-                "contains the frames of another film, or of an earlier version of this one",
-                path=folder,
-                hint="Add --update to take those of this film, or choose another place with -o",
-            )
+            problem = "contains the frames of another film, or of an earlier version of this one"
+            hint = "Add --update to take those of this film, or choose another place with -o"
+            raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
             advance(1)
@@ -74,22 +66,18 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
 
 def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
     """Return the stamp of the film whose frames are in the folder, and their sizes; empty without such frames."""
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         record = read_json(folder / _RECORD)
         frames = {str(name): int(size) for name, size in record["frames"].items()}
         if len(frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, frames)):
             return str(record["sha256"]), frames
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass
     return "", {}
 
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
-
-
+# Interval between checks of the files of a capture that was already returned. In between, only its folders are checked:
+# their times change when a file is added, removed or replaced, but not when one is overwritten in place.
 SECONDS_BETWEEN_FILES = 60.0
-"""Interval between checks of the files of a capture that was already returned. In between, only its folders are
-checked: their times change when a file is added, removed or replaced, but not when one is overwritten in place."""
 
 
 @dataclass
@@ -165,10 +153,9 @@ class Arrivals:
 
 
 def _changed(folder: str) -> int:
-    try:
+    with suppress(OSError):
         return os.stat(folder).st_mtime_ns  # noqa: PTH116 - see _stamp
-    except OSError:
-        return -1
+    return -1
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:

@@ -1,13 +1,12 @@
 """Estimate the normals of one capture: read it, check it, run the method, write the results.
 
-Both `infer` and splinecli.estimate_normals use this code, with all checks and warnings. On large captures, or on
-request, a distilled estimator replaces the network.
+Both `infer` and splinecli.estimate_normals use this code. A distilled estimator may replace the network.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -33,6 +32,7 @@ from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
 from splinecli.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import make_surface, view_of_report
 from splinecli.results import files
@@ -42,7 +42,7 @@ from splinecli.results.pages import result_page
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
-from splinecli.system.progress import SILENT, Advance, Clock, Observer
+from splinecli.system.progress import SILENT, Clock, Observer
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 if TYPE_CHECKING:
@@ -52,16 +52,14 @@ if TYPE_CHECKING:
 BASE_BYTES = 500 * 2**20  # for Python, PyTorch and a batch of pixels; captures and their refinement need more
 REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # most pixels refined at once (a tile with its margin); bytes per pixel
 
-INDIRECT_BYTES = 4  # per pixel of the capture, for its indirect light
-_WORTH_A_MASK = 10**9  # bytes above which the mask is read, to find out how many of them are needed
-
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the memory in bytes that spline-net needs for a capture, in addition to BASE_BYTES.
 
     It follows from the size of the largest image, the number of pixels in the mask and the number of images read.
     """
-    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    of_indirect_light = 4 * n_pixels
+    of_pixels = of_indirect_light + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
 
@@ -77,46 +75,46 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         n_lights = n_lights or source.n_lights
         n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
         n_bytes = infer_bytes(size, n_pixels, n_lights)
-        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
+        is_large = n_bytes > 10**9  # so that it is worth reading the mask
+        if is_large and (source.files.mask is not None or source.files.boundaries):
             n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
     except (SplinecliError, OSError, MemoryError):
         return 0.0
     return float(n_bytes)
 
 
-AUTOMATIC_FROM = 100_000
-"""Pixels from which a capture is distilled by default.
-
-This is a constant and not timed at run time, because the machine's load must not change the normals. From this size on,
-distillation takes less than half of the network's time on 1 to 16 cores and on an H100, under 10 and 96 lights.
-"""
-
-
 def distil_for(
-    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
+    capture: Capture, estimator: Estimator, wanted: bool | None, clock: Clock | None = None
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
     Under near lamps, the capture must contain its surface points. With `wanted` = None, AUTOMATIC_FROM decides. Raises
     UsageError if distillation is requested, but the method does not estimate a confidence, or the capture is too small.
     """
+
+    def refuse(problem: str) -> tuple[None, list[CaptureWarning]]:
+        if wanted:
+            raise UsageError(problem, hint="Leave --distil out")
+        return None, []
+
+    clock = clock or Clock()
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not estimator.has_confidence:
-        return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
+        return refuse(f"method {estimator.name} gives no confidence and cannot be distilled")
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
-        return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
+        return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
     teacher = estimator.bind(lighting_at, capture.n_pixels)
     from splinecli.methods.distilled import distil
 
     for size in sizes:
         try:
-            with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
+            advance = clock.begin("distil", 2 * size.sample, "learning the capture")
+            distilled = distil(teacher, lighting_at, capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
-            return _refuse(wanted, f"{capture.name}: {error.problem}")
+            return refuse(f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
             return distilled, []
     text = (
@@ -127,15 +125,6 @@ def distil_for(
     return None, [CaptureWarning(NOT_DISTILLED, text)]
 
 
-def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:
-    if wanted:
-        raise UsageError(problem, hint="Leave --distil out")
-    return None, []
-
-
-_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # the clock's names
-
-
 def estimate_capture(
     capture: Capture,
     estimator: Estimator,
@@ -144,7 +133,6 @@ def estimate_capture(
     refine_lights: Callable[[Capture], Capture] | None = None,
     distil: bool | None = None,
     strict: bool = False,
-    observer: Observer = SILENT,
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
@@ -152,11 +140,11 @@ def estimate_capture(
 
     The capture already contains the warnings from reading it. `check` returns the warnings about its lights and images
     (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
-    is called with the number of pixels just estimated, instead of the observer. With `strict`, a warning that an input
-    is probably wrong becomes an InputError. The stages are reported to the observer and timed by the clock.
+    is called with the number of pixels just estimated. With `strict`, a warning that an input is probably wrong becomes
+    an InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
-    clock.begin("check")
+    clock.begin("check", note="checking")
     warnings = [*capture.warnings, *check(capture)]
     refuse_if_strict(warnings, capture.name, strict=strict)
     if refine_lights is not None:
@@ -165,19 +153,10 @@ def estimate_capture(
         warnings = [warning for warning in warnings if warning.kind != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
     capture = replace(capture, warnings=tuple(warnings))
-    clock.begin("estimate")
     capture = find_surface(capture)
-    clock.begin("distil")
-    distilled, found = distil_for(capture, estimator, distil, observer)
-    with ExitStack() as stages:
-
-        def stage(name: str) -> AbstractContextManager[Advance]:
-            stages.close()  # show only one progress bar at a time
-            clock.begin(_STAGES.get(name, "estimate"))
-            return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
-
-        advance = stages.enter_context(stage("estimating"))
-        estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
+    distilled, found = distil_for(capture, estimator, distil, clock)
+    advance = clock.begin("estimate", capture.n_pixels, "estimating")
+    estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, clock=clock)
     warnings += found
     warnings += [CaptureWarning(UNTRAINED_LIGHTS, text) for text in estimator.warn_of_lights(capture.n_lights)]
     # The other warnings explain why the confidence is low.
@@ -204,23 +183,22 @@ def infer_capture(
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
-    with held_results(capture_name(folder), options, observer) as target:
-        clock = Clock()
+    name = capture_name(folder)
+    with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
+        clock = Clock(show)
         if options.finds_lights:
             _check_light_files(target)
-        source, capture = _read(folder, options, observer)
         estimator = estimator or make_method(options)
+        source, capture = _read(folder, options, estimator.has_confidence, clock)
         _check_results(capture, folder, options)
+        refine = partial(refine_capture, intensities_known=source.intensities_known)
         estimate, distilled = estimate_capture(
             capture,
             estimator,
             partial(check_capture, source, strict=options.strict),
-            refine_lights=partial(refine_capture, intensities_known=source.intensities_known)
-            if options.refine_lights
-            else None,
+            refine_lights=refine if options.refine_lights else None,
             distil=options.distil,
             strict=options.strict,
-            observer=observer,
             clock=clock,
         )
         for warning in estimate.capture.warnings:
@@ -237,8 +215,8 @@ def infer_capture(
         )
         if source.light_numbers is not None:
             report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
-        found = _make_files(source, estimate, report, options, observer, clock)
-        clock.begin("write")
+        found = _make_files(source, estimate, report, options, clock)
+        clock.begin("write", note="writing")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
 
 
@@ -275,32 +253,34 @@ def make_method(options: InferOptions) -> Estimator:
     return estimator
 
 
-def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture]:
+def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> tuple[CaptureSource, Capture]:
     source = options.open(folder)
-    name = source.files.name
-    if options.auto_mask:
-        with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
-            source = source.find_mask(lambda: advance(1))
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
+    height, width, *_ = source.facts[0].size[0]
+    seconds = partial(expected_seconds, n_images=count, image_pixels=height * width, network=network)
+    clock.expect(seconds(height * width, distils=options.distil))
+    if options.auto_mask:
+        advance = clock.begin("read", 2 * source.n_lights, "finding the object")
+        source = source.find_mask(lambda: advance(1))
     if options.align:
-        source = align(source, indices, observer)
-    with observer.progress(f"{name}: reading", count) as advance:
-        capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
+        advance = clock.begin("read", 2 * count, "aligning")
+        source = align(source, indices, lambda: advance(1))
+    advance = clock.begin("read", count, "reading")
+    capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
+    rest = seconds(capture.n_pixels, distils=options.distil)
+    clock.expect({stage: rest[stage] for stage in rest if stage != "read"})
     return source, capture
 
 
-def align(source: CaptureSource, indices: Sequence[int] | None, observer: Observer) -> CaptureSource:
+def align(
+    source: CaptureSource, indices: Sequence[int] | None, progress: Callable[[], object] = lambda: None
+) -> CaptureSource:
     """Return the capture with its images aligned, and then with a new automatic mask if it had one."""
-    name, count = source.files.name, source.n_lights if indices is None else len(indices)
-    found = source.automatic_mask is not None
-    with observer.progress(f"{name}: aligning", count * (1 + found)) as advance:
-        source = source.align(indices, lambda: advance(1))
-        if found:
-            source = replace(source, automatic_mask=None).find_mask(lambda: advance(1))
-    return source
+    aligned = source.align(indices, progress)
+    return aligned if source.automatic_mask is None else replace(aligned, automatic_mask=None).find_mask(progress)
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
@@ -308,13 +288,10 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
     costly = [row.name for row in chosen_maps(options.maps, page=options.html) if row.bytes_per_pixel]
     avoidable = [f"--maps {name}" for name in costly if name in options.maps]
     avoidable += ["--html"] * options.html + ["--surface"] * options.surface
-    check_memory(
-        results_bytes(capture.n_pixels, capture.n_lights, maps=costly, surface=options.surface),
-        f"the results of {capture.n_pixels} pixels take",
-        folder,
-        hint="Mask the object, or use --scale or --crop"
-        + (f", or leave out {' and '.join(avoidable)}" if avoidable else ""),
-    )
+    hint = "Mask the object, or use --scale or --crop"
+    hint += f", or leave out {' and '.join(avoidable)}" if avoidable else ""
+    needed = results_bytes(capture.n_pixels, capture.n_lights, maps=costly, surface=options.surface)
+    check_memory(needed, f"the results of {capture.n_pixels} pixels take", folder, hint=hint)
     if options.surface:
         check_triangles(capture.mask, folder)
 
@@ -324,11 +301,8 @@ def _check_light_files(target: Path) -> None:
     own = files.own_light_files(target)
     for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
-            raise OutputError(
-                "the file is not from an earlier run, and --lights estimate would overwrite it",
-                path=target / name,
-                hint="Choose another -o",
-            )
+            problem = "the file is not from an earlier run, and --lights estimate would overwrite it"
+            raise OutputError(problem, path=target / name, hint="Choose another -o")
 
 
 def _make_files(
@@ -336,27 +310,33 @@ def _make_files(
     estimate: NormalEstimate,
     report: dict[str, Any],
     options: InferOptions,
-    observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
     """Compute the results that the options request, add the surface to the report, and return the files."""
     capture = estimate.capture
-    clock.begin("pictures")
+    clock.begin("pictures", note="maps")
     made: dict[str, NDArray[np.float32]] = {}
     for row in chosen_maps(options.maps, page=options.html):
         if not (row.bytes_per_pixel or (options.html and row.caption)):
             continue  # computed when it is written
         if row.reads_images:
-            with observer.progress(f"{capture.name}: {row.name}", capture.n_lights) as advance:
-                values = make_map(row, source, estimate, lambda: advance(1))
+            count = partial(clock.begin("pictures", capture.n_lights, row.name), 1)
+            values = make_map(row, source, estimate, count)
         else:
             values = make_map(row, source, estimate)
         if values is not None:
             made[row.name] = values
     scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
+
+    def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
+        """Yield the files of a map, which is computed when they are written unless it already exists."""
+        values = made[row.name] if row.name in made else make_map(row, source, estimate)
+        if values is not None:
+            yield from map_files(row, values, capture.mask, options.formats, scale=scales.get(row.name))
+
     found: list[Iterable[tuple[str, Content]]] = [
         files.normal_files(estimate, options.formats, options.convention),
-        *(_map_files(row, made, source, estimate, options.formats, scales) for row in chosen_maps(options.maps)),
+        *map(map_of, chosen_maps(options.maps)),
     ]
     light_plot = None
     if capture.light_errors_deg is not None:
@@ -365,19 +345,18 @@ def _make_files(
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
-        clock.begin("surface")
+        advance = clock.begin("surface", note="integrating")
         camera_matrix, pixel_size = view_of_report(report)
         colours = map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
-        with observer.progress(f"{capture.name}: integrating", 1) as advance:
-            surface, report["surface"] = make_surface(
-                estimate.normal_map,
-                capture.mask,
-                camera_matrix,
-                colours,
-                discontinuity=options.discontinuity,
-                pixel_size_mm=pixel_size,
-                progress=advance,
-            )
+        surface, report["surface"] = make_surface(
+            estimate.normal_map,
+            capture.mask,
+            camera_matrix,
+            colours,
+            discontinuity=options.discontinuity,
+            pixel_size_mm=pixel_size,
+            progress=advance,
+        )
         formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
         found.append(encode_surface(surface, formats))
     if options.html:
@@ -392,20 +371,6 @@ def _make_files(
         )
         found.append([(PAGE, page)])
     return found
-
-
-def _map_files(
-    row: OutputMap,
-    made: Mapping[str, NDArray[np.float32]],
-    source: CaptureSource,
-    estimate: NormalEstimate,
-    formats: Sequence[str],
-    scales: Mapping[str, float],
-) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map, which is computed now unless it already exists."""
-    values = made[row.name] if row.name in made else make_map(row, source, estimate)
-    if values is not None:
-        yield from map_files(row, values, estimate.capture.mask, formats, scale=scales.get(row.name))
 
 
 def results_bytes(n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False) -> int:

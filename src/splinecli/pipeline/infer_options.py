@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from msgspec import Meta
 
+from splinecli import records
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
@@ -27,19 +28,7 @@ from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
-from splinecli.records import (
-    FileName,
-    NotNegative,
-    Option,
-    Positive,
-    Record,
-    Seed,
-    complete_list,
-    field_types,
-    listed,
-    long_name,
-    option_of,
-)
+from splinecli.records import FileName, NotNegative, Option, Positive, Record, Seed
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file
@@ -115,9 +104,8 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.address is not None and self.workers != 1:
-            raise UsageError(
-                "--workers and --cluster contradict each other", hint="Leave --workers out: the cluster has its workers"
-            )
+            hint = "Leave --workers out: the cluster has workers of its own"
+            raise UsageError("--workers and --cluster contradict each other", hint=hint)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
         """Return these options with 0 replaced by one process per core, limited to one process per item.
@@ -152,7 +140,7 @@ class Reading(Record, frozen=True, kw_only=True):
     ground_truth: Annotated[FileName | None, Option("Input", "FILE",
         "True normals to compare with (.mat, .npy, text, PNG, TIFF).")] = None
     transfer: Annotated[str, Option("Input", "CURVE",
-        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads files as they say; JPEG as sRGB.",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files, and reads JPEG as sRGB.",
         complete=CURVES)] = AUTOMATIC
     ambient: Annotated[FileName | None, Option("Input", "FILE",
         "Image taken without the lights, to subtract from all images.", default="ambient.*")] = None
@@ -169,7 +157,7 @@ class Reading(Record, frozen=True, kw_only=True):
     light_frame: Annotated[str | None, Option("Lights", "LIST",
         f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y stands before x).",
         default="x right, y up, z to the camera",
-        complete=complete_list(("x-left", "y-down", "z-away", EXCHANGED)))] = None
+        complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)))] = None
     light_format: Annotated[LightForm, Option("Lights", "",
         "Numbers of a light in a text file: a vector x y z; azel, azimuth and elevation; or slant-tilt, the"
         " angles of HALCON. Angles are in degrees.")] = "xyz"
@@ -195,7 +183,7 @@ class Reading(Record, frozen=True, kw_only=True):
         "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is then estimated in the"
         " frame of its viewing ray.", default="camera_matrix.txt in CAPTURE, or orthographic")] = None
     strict: Annotated[bool, Option("Output", "",
-        "Fail (exit code 3) where a warning says that the lights or the images are probably wrong.")] = False
+        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.")] = False
     surface = False  # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
 
     def __post_init__(self) -> None:
@@ -209,10 +197,8 @@ class Reading(Record, frozen=True, kw_only=True):
         }
         for option, reason in reasons.items():
             if self.finds_lights and reason:
-                raise UsageError(
-                    f"--lights estimate {reason}, so it contradicts {option}",
-                    hint=f"Leave {option} out, or give a light file",
-                )
+                problem = f"--lights estimate {reason}, so it contradicts {option}"
+                raise UsageError(problem, hint=f"Leave {option} out, or give a light file")
         if self.crosstalk is not None and not self.lights_in_channels:
             raise UsageError("--crosstalk needs --lights-in-channels", hint="Add it, or leave both out")
         if self.lights_in_channels and self.align:
@@ -315,7 +301,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         "Use these lights, counted from 0. Plots and warnings count from 1.",
         parse=partial(parse_indices, option="--light-indices"))] = None
     method: Annotated[str, Option("Method", "METHOD",
-        f"Method to use: {listed(method_names())}.", complete=method_names())] = DEFAULT_METHOD
+        f"Method to use: {records.listed(method_names())}.", complete=method_names())] = DEFAULT_METHOD
     weights: Weights = None
     distil: Annotated[bool | None, Option("Speed", "",
         "Approximate the network by a smaller one, trained on a sample of the capture's pixels, or use the method on"
@@ -324,11 +310,11 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     precision: PrecisionName = "auto"
     output: Annotated[FileName, Option("Output", "OUT", "Write results to OUT/<capture name>/.", names=OUTPUT)] = "out"
     formats: Annotated[tuple[str, ...], Option("Output", "LIST",
-        f"Files of the normal map: any of {listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are float32."
-        " With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are"
+        " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
         items=NORMALS)] = ("png", "npy")
     maps: Annotated[tuple[str, ...], Option("Output", "LIST",
-        f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
+        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
         " pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.", items=MAPS)] = ()
     curvature_scale: Positive = CURVATURE_SCALE
     relief_scale: Positive = RELIEF_SCALE
@@ -375,10 +361,10 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     def changes(self, earlier: InferOptions) -> list[str]:
         """Return the options that affect the results, which excludes --output and --device."""
-        kinds = {name: kind for name, kind in field_types(type(self)).items() if name not in ("output", "device")}
+        kinds = records.field_types(type(self))
         names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
-        options = {name: option_of(kinds[name]) for name in names}
-        return list(dict.fromkeys(long_name(name, of) if of else _SCALE[name] for name, of in options.items()))
+        options = {name: records.option_of(kinds[name]) for name in names if name not in ("output", "device")}
+        return list(dict.fromkeys(records.long_name(name, of) if of else _SCALE[name] for name, of in options.items()))
 
     @property
     def method_options(self) -> MethodOptions:
@@ -419,10 +405,8 @@ class Shard(NamedTuple):
             raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
         number, count = int(found[1]), int(found[2])
         if not 1 <= number <= count:
-            raise UsageError(
-                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
-                hint="If your job numbers count from 0, add 1",
-            )
+            problem = f"--shard is {number}/{count}; expected I/N with I from 1 to N"
+            raise UsageError(problem, hint="If your job numbers count from 0, add 1")
         return cls(number, count)
 
 

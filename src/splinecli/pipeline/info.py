@@ -17,73 +17,54 @@ from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.estimator import student_sizes
 from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import AUTOMATIC_FROM, BASE_BYTES, align, infer_bytes
-from splinecli.pipeline.infer_options import Reading
+from splinecli.pipeline.infer import BASE_BYTES, align, infer_bytes
+from splinecli.pipeline.infer_options import InfoOptions, Reading
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
-# Pixels per second on a laptop's processor; benchmarks/inference_speed.py measures the speed of your machine.
-PIXELS_PER_SECOND = 2000  # of spline-net
-DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
-
+# The sources of a white level, as human-readable text.
 ORIGINS = {
     "given": "given by --white-level",
     "file": "stated by the image files",
     "images": "found in the images",
     "full scale": "the full scale of the files",
 }
-"""The sources of a white level, as human-readable text."""
 
 
 def describe_capture(
-    capture: Path,
-    reading: Reading | None = None,
-    observer: Observer = SILENT,
-    *,
-    plot: Path | None = None,
-    overwrite: bool = False,
-    check_lights: bool = False,
-    auto_mask: bool = False,
-    mended_lights: Path | None = None,
+    options: InfoOptions, reading: Reading | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the corrected lights, and return the report.
 
-    Args:
-        reading: how `infer` would read the capture. With `reading.strict`, skipped checks are also warnings.
-        plot, overwrite, check_lights, auto_mask, mended_lights: as in the help of `info`.
-
-    Raises:
-        InputError: the folder does not contain a capture, or a file cannot be read.
-        OutputError: a file exists and `overwrite` is not set, or it cannot be written.
-        UsageError: the plot would be in the folder of the images, or options contradict each other.
+    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also warnings. Raises
+    InputError, OutputError, or UsageError if the plot would be in the folder of the images, or options contradict.
     """
-    reading = reading or Reading()
-    for name, given in (("--check-lights", check_lights), ("--mended-lights", mended_lights is not None)):
+    reading, plot, mended_lights = reading or Reading(), options.plot, options.mended_lights
+    for name, given in (("--check-lights", options.check_lights), ("--mended-lights", mended_lights is not None)):
         if given and reading.finds_lights:
             raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
     with TemporaryDirectory() as frames:  # extracted from a film
-        source = reading.open(unpacked(capture, Path(frames), reading, observer, redo="all"))
+        source = reading.open(unpacked(options.capture, Path(frames), reading, observer, redo="all"))
         common_size(source.facts)  # as in `infer`
-        if auto_mask:
+        if options.auto_mask:
             with observer.progress("finding the object", source.n_lights) as advance:
                 source = source.find_mask(lambda: advance(1))
         if reading.align:
-            source = align(source, None, observer)
+            with observer.progress("aligning", source.n_lights) as advance:
+                source = align(source, None, lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-                raise UsageError(
-                    f"the plot {plot} would be in the folder of the images and count as an image of the capture",
-                    hint="Choose another folder for it",
-                )
-            check_free(plot.parent, [plot.name], overwrite=overwrite)
+                problem = f"the plot {plot} would be in the folder of the images and count as an image of the capture"
+                raise UsageError(problem, hint="Choose another folder for it")
+            check_free(plot.parent, [plot.name], overwrite=options.overwrite)
         if mended_lights is not None:
             check_writable(mended_lights)
             if source.lamps is not None and source.lamps.used:
                 raise UsageError("--mended-lights writes directions, but the lights are near lamps")
-            check_free(mended_lights.parent, [mended_lights.name], overwrite=overwrite)
+            check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
         with observer.progress("reading", len(source.files.images)) as advance:
             summary = summarise_capture(source, progress=lambda: advance(1))
         summary, found_lights = _with_found_lights(summary)
@@ -95,10 +76,8 @@ def describe_capture(
             write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
         check, warnings = None, summary.warnings()
         if summary.samples is not None:
-            indices = range(source.n_lights)
-            check, found = check_sample(
-                CaptureSample.of_source(source, summary.samples, indices, strict=reading.strict)
-            )
+            seen = CaptureSample.of_source(source, summary.samples, range(source.n_lights), strict=reading.strict)
+            check, found = check_sample(seen)
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))
@@ -114,7 +93,7 @@ def describe_capture(
             if mended is not None:
                 write_bytes(mended_lights, encode_lights(mended_lights, mended, source.files.images))
             report["mended_lights"] = None if mended is None else str(mended_lights)
-        if check_lights:
+        if options.check_lights:
             report["light_candidates"] = [] if check is None else candidate_rows(check)
         return report
 
@@ -156,9 +135,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
                    f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface"),
     ]  # fmt: skip
     if "mended_lights" in report:
-        rows.append(
-            ("mended", report["mended_lights"] or "not written: no other reading of the lights fits clearly better")
-        )
+        nothing = "not written: no other reading of the lights fits clearly better"
+        rows.append(("mended", report["mended_lights"] or nothing))
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
 
 
@@ -210,11 +188,16 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     source, files, level = summary.source, summary.source.files, summary.white_level
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
-    intensities = files.light_intensities
-    first, seconds = summary.images[0], 3 + _seconds(summary)
-    view = find_view(source.facts[0], None)
+    intensities, view = files.light_intensities, find_view(source.facts[0], None)
+    first = summary.images[0]
+    stages = expected_seconds(summary.n_pixels, len(summary.images), first.shape[0] * first.shape[1])
+    seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
+
+    def text(path: Path | None) -> str | None:
+        return None if path is None else str(path)
+
     if intensities is None and source.intensities_measured and (source.light_intensities != 1).any():
         intensities = files.light_directions  # AliceVision's light files contain both
     return {
@@ -223,12 +206,10 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "images": len(summary.images),
         "first_image": first.path.name,
         "last_image": summary.images[-1].path.name,
-        "image_kinds": [
-            {"size": [width, height], "channels": channels, "type": dtype} for width, height, channels, dtype in kinds
-        ],
+        "image_kinds": [{"size": [w, h], "channels": channels, "type": dtype} for w, h, channels, dtype in kinds],
         "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,
-        "light_directions": None if files.light_directions is None else str(files.light_directions),
+        "light_directions": text(files.light_directions),
         "estimated_lights": None
         if found is None
         else {
@@ -239,13 +220,9 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "lamps": None if source.lamps is None else source.lamps.in_words(),
         "camera_matrix": None if source.camera_matrix is None else source.camera_matrix.tolist(),
         "exif_camera_matrix": view.matrix.round(1).tolist() if view.known else None,
-        "light_intensities": None if intensities is None else str(intensities),
-        "mask": "found in the images"
-        if source.automatic_mask is not None
-        else None
-        if files.mask is None
-        else str(files.mask),
-        "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
+        "light_intensities": text(intensities),
+        "mask": text(files.mask) if source.automatic_mask is None else "found in the images",
+        "ground_truth": text(files.ground_truth),
         "axis_angle_deg": None
         if source.find_lights is not None and found is None
         else [round(float(angles.min()), 1), round(float(angles.max()), 1)],
@@ -261,12 +238,3 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
             "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
         },
     }
-
-
-def _seconds(summary: CaptureSummary) -> float:
-    """Return the runtime of spline-net on a capture, with distillation if `infer` would use it at this size."""
-    count = summary.n_pixels
-    if count < AUTOMATIC_FROM:
-        return count / PIXELS_PER_SECOND
-    # Estimation on the sample and training on it together process 1000 pixels per second.
-    return student_sizes(count)[0].sample / 1000 + count / DISTILLED_PER_SECOND

@@ -4,6 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -25,6 +26,7 @@ from splinecli.pictures.maps import encode_png
 from splinecli.pipeline.infer_options import check_pixel_size
 from splinecli.pipeline.options import IntegrateOptions
 from splinecli.results.files import UnfinishedError, read_report
+from splinecli.surface import surface_files
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
@@ -37,9 +39,7 @@ from splinecli.surface.surface_files import (
     SURFACE_FILES,
     SURFACE_REPORT,
     Surface,
-    check_exr,
     encode_surface,
-    file_names,
 )
 from splinecli.system.files import check_free, read_json
 from splinecli.system.machine import import_extra
@@ -155,25 +155,17 @@ def view_of_report(
     return matrix, None if pixel_size_mm is None else pixel_size_mm * window.step
 
 
-INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder, exact ones first
-
-
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Integrate a normal map, write the surface and its report, and return the report.
-
-    Raises InputError if a file cannot be read, or the files do not fit together; OutputError if the results exist and
-    `overwrite` is not set, or cannot be written; UsageError if the discontinuity or the largest step is negative.
-    """
+    """Integrate a normal map, write the surface and its report, and return the report. Raises SplinecliError."""
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
-    check_exr(options.formats)
+    surface_files.check_exr(options.formats)
     with held_folder(options.folder, observer.warn):
         check_free(options.folder, options.files, overwrite=options.overwrite)
         return _integrate_into(options, observer)
 
 
 def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
-    """Run integrate_normal_map in the folder of results, which the caller has locked."""
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
@@ -257,13 +249,13 @@ def _earlier_files(folder: Path) -> list[str]:
     """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer` are kept."""
     try:
         named = read_json(folder / SURFACE_REPORT)["files"]
-        return [name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
+        return [name for name in (*surface_files.file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 
 
 def _find_normal_map(folder: Path) -> Path:
-    names = [NORMALS[name] for name in INPUT_FORMATS]
+    names = [NORMALS[name] for name in ("npy", "tiff", "png", "png8")]  # exact ones first
     try:
         files = read_report(folder)["files"]
         return folder / next(name for name in names if name in files)
@@ -284,17 +276,13 @@ def _report_of(path: Path) -> dict[str, Any] | None:
             return None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    try:
+    with suppress(ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
         convention, discontinuity = report["options"]["convention"], float(report["options"]["discontinuity"])
         if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
             return report
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
-        pass
-    raise InputError(
-        "is damaged, or from another version: it does not say how the normal map beside it was made",
-        path=path.parent / REPORT,
-        hint="Run 'splinecli infer' again, or move the normal map to another folder",
-    )
+    problem = "is damaged, or from another version: it does not say how the normal map beside it was made"
+    hint = "Run 'splinecli infer' again, or move the normal map to another folder"
+    raise InputError(problem, path=path.parent / REPORT, hint=hint)

@@ -4,6 +4,7 @@
 # fmt: off
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -16,30 +17,8 @@ from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, METHODS, MethodOptions, check_method, method_names
-from splinecli.pipeline.infer_options import (
-    CURVES,
-    DISCONTINUITY_HELP,
-    HERE,
-    LARGEST_PIXEL_MM,
-    MASK_IMAGE,
-    OUTPUT,
-    SMALLEST_PIXEL_MM,
-    AsStored,
-    ClusterOptions,
-    DeviceName,
-    Display,
-    Overwrite,
-    PrecisionName,
-    Quiet,
-    RandomSeed,
-    RefineLights,
-    Update,
-    Weights,
-    WhiteLevel,
-    Workers,
-    complete_weights,
-    parse_indices,
-)
+from splinecli.pipeline import infer_options as shared
+from splinecli.pipeline.infer_options import HERE, MASK_IMAGE, OUTPUT, ClusterOptions, Display, Workers, parse_indices
 from splinecli.records import Count, FileName, Natural, NotNegative, Option, Positive, Record, Seed, listed
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import DEFAULT_FORMATS, LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
@@ -48,17 +27,15 @@ from splinecli.training import defaults
 DEFAULT_TRIALS = 100
 TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
 DEFAULT_LIGHTS = 10
-_MOST_DIGITS = 18  # in a number of images
+
 
 
 def parse_circle(text: str) -> tuple[float, float, float]:
     """Return the numbers in a text "X,Y,R". Raises UsageError."""
-    try:
+    with suppress(ValueError):
         x, y, radius = (float(word) for word in text.split(","))
         if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
             return x, y, radius
-    except ValueError:
-        pass
     raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
 
 
@@ -85,24 +62,21 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
         "The images of the gray ball are colour images under three coloured lamps at once: measure their crosstalk."
         " BALL has an image under each lamp alone, in the order R, G, B.")] = False
     transfer: Annotated[str, Option("Light intensities", "CURVE",
-        "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.", complete=CURVES)] = AUTOMATIC
+        "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
+        complete=shared.CURVES)] = AUTOMATIC
     compare: Annotated[Path | None, Option("Output", "FILE",
         "Compare the result with the light directions in a text file.")] = None
     output: Annotated[Path, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = Path("calibration")
-    overwrite: Overwrite = False
+    overwrite: shared.Overwrite = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
-            raise UsageError(
-                "--transfer needs --gray-ball or --gray-card",
-                hint="Leave it out: the light directions do not depend on the curve",
-            )
+            hint = "Leave it out: the light directions do not depend on the curve"
+            raise UsageError("--transfer needs --gray-ball or --gray-card", hint=hint)
         if self.ball_diameter is not None and len(self.balls) < 2:
-            raise UsageError(
-                "--ball-diameter needs two balls or more",
-                hint="Photograph a second ball, or the same ball at another place: one ball gives no positions",
-            )
+            hint = "Photograph a second ball, or the same ball at another place: one ball gives no positions"
+            raise UsageError("--ball-diameter needs two balls or more", hint=hint)
         if self.lights_in_channels and not self.gray_ball:
             raise UsageError("--lights-in-channels needs --gray-ball", hint="Photograph a matte gray or white ball")
         if self.gray_ball and self.gray_card:
@@ -110,10 +84,8 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
         for option, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
-                raise UsageError(
-                    f"{option} is given {times} for {len(self.balls)} balls",
-                    hint="Give it once for each ball, in the same order",
-                )
+                problem = f"{option} is given {times} for {len(self.balls)} balls"
+                raise UsageError(problem, hint="Give it once for each ball, in the same order")
 
 
 def parse_level(text: str) -> tuple[tuple[int, int], ...]:
@@ -140,8 +112,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     camera_matrix: Annotated[Path | None, Option("Input", "FILE",
         "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
         default="as in report.json beside the normal map, or orthographic")] = None
-    pixel_size: Annotated[Annotated[float, Meta(ge=SMALLEST_PIXEL_MM, le=LARGEST_PIXEL_MM)] | None, Option("Input",
-        "MM", "Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres.",
+    pixel_size: Annotated[Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None,
+        Option("Input", "MM",
+        "Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres.",
         default="that of infer --surface, by report.json beside the normal map, or in pixels")] = None
     pixel_aspect: Annotated[Annotated[float, Meta(ge=0.01, le=100)], Option("Input", "A",
         "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled images.")] = 1.0
@@ -155,7 +128,7 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         " it, and the detail from the normals. .npy, .tif or .exr, with heights towards the camera in the unit"
         " of the result, or with depths in millimetres for a perspective camera. NaN is unknown.")] = None
     discontinuity: Annotated[NotNegative | None, Option("Method", "K",
-        DISCONTINUITY_HELP, default=f"as in report.json beside the normal map, or {DISCONTINUITY:g}")] = None
+        shared.DISCONTINUITY_HELP, default=f"as in report.json beside the normal map, or {DISCONTINUITY:g}")] = None
     prior_detail: Annotated[Annotated[float, Meta(ge=1)] | None, Option("Method", "PIXELS",
         "With --prior: shapes narrower than this come from the normals.", default="15 % of the object's size")] = None
     largest_step: Annotated[NotNegative | None, Option("Method", "PIXELS",
@@ -171,7 +144,7 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     decimate: Annotated[Count | None, Option("Output", "N",
         "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs the extra 'mesh').",
         default="all")] = None
-    overwrite: Overwrite = False
+    overwrite: shared.Overwrite = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -203,7 +176,7 @@ def parse_light_count(text: str) -> int | None:
 def parse_skip(text: str) -> tuple[str, int]:
     """Return ("bearPNG", 20) for "bearPNG=20" and ("*", 20) for "20". Raises UsageError."""
     name, equals, count = text.rpartition("=")
-    if not count.isdecimal() or len(count) > _MOST_DIGITS or bool(name) != bool(equals):
+    if not count.isdecimal() or len(count) > 18 or bool(name) != bool(equals):
         raise UsageError(f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20")
     return name or EVERY_CAPTURE, int(count)
 
@@ -230,8 +203,8 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         repeated=True)] = ()
     max_pixels: Annotated[Count | None, Option("Input", "N", "Score N random pixels of each capture.",
         default="all")] = None
-    as_stored: AsStored = False
-    white_level: WhiteLevel = None
+    as_stored: shared.AsStored = False
+    white_level: shared.WhiteLevel = None
     lights: Annotated[str | None, Option("Lights", "estimate",
         "Estimate the lights of each draw from its images, and score them, too.",
         default="the captures' light files")] = None
@@ -240,23 +213,23 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         repeated=True)] = ()
     trials: Annotated[Count | None, Option("Lights", "T", "Number of random draws.",
         default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} of four methods or more")] = None
-    seed: RandomSeed = 0
+    seed: shared.RandomSeed = 0
     draws: Annotated[FileName | None, Option("Lights", "FILE",
         "Draws of lights: each line has light indices, counted from 0.")] = None
     light_noise_deg: Annotated[tuple[NotNegative, ...], Option("Lights", "SIGMA",
         "Tilt the lights at random, with this standard deviation in degrees. May be repeated.", repeated=True)] = (0.0,)
-    refine_lights: RefineLights = False
+    refine_lights: shared.RefineLights = False
     light_error_deg: Annotated[float | None, Option("Lights", "SIGMA",
         "With --refine-lights: usual error of the directions in degrees.", default="5")] = None
     methods: Annotated[tuple[str, ...], Option("Method", "M",
         f"Method to score: all, {listed(method_names())}. May be repeated.", names=("--method",),
         complete=(*method_names(), "all"), repeated=True)] = (DEFAULT_METHOD,)
-    weights: Weights = None
+    weights: shared.Weights = None
     rotations: Annotated[Count | None, Option("Method", "R",
         "Average the network's result over R views of each pixel: its lights rotated, for spline-net also mirrored.",
         default="1; cnn-ps: 10")] = None
-    device: DeviceName = "auto"
-    precision: PrecisionName = "auto"
+    device: shared.DeviceName = "auto"
+    precision: shared.PrecisionName = "auto"
     jobs: Annotated[Count | None, Option("Speed", "N", "Number of trials at a time.",
         default="number of cores; 1 on a GPU")] = None
     cluster: ClusterOptions = HERE
@@ -271,38 +244,28 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.draws is not None and self.n_lights:
-            raise UsageError(
-                "--draws and --n-lights contradict each other",
-                hint="Leave --n-lights out: the draws determine the number of lights",
-            )
+            hint = "Leave --n-lights out: the draws determine the number of lights"
+            raise UsageError("--draws and --n-lights contradict each other", hint=hint)
         if self.draws is not None and self.trials is not None:
-            raise UsageError(
-                "--draws and --trials contradict each other",
-                hint="Leave --trials out: each line of the draws is a trial",
-            )
+            hint = "Leave --trials out: each line of the draws is a trial"
+            raise UsageError("--draws and --trials contradict each other", hint=hint)
         from splinecli.lights.light_fit import check_light_error
 
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
-            raise UsageError(
-                f"--lights is {self.lights}; expected {ESTIMATE}", hint="Without it, the captures' light files count"
-            )
+            hint = "Without it, the light files of the captures are used"
+            raise UsageError(f"--lights is {self.lights}; expected {ESTIMATE}", hint=hint)
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
-            raise UsageError(
-                "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
-                hint="Leave these out",
-            )
+            problem = "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg"
+            raise UsageError(problem, hint="Leave these out")
         if self.cluster != HERE and self.jobs is not None:
-            raise UsageError(
-                "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
-            )
+            hint = "Leave it out: a worker scores one trial at a time"
+            raise UsageError("--jobs contradicts --workers and --cluster", hint=hint)
         for name in self.names:
             check_method(name)
         if self.pixels and not (self.figures and any(METHODS[name].observation_maps for name in self.names)):
-            raise UsageError(
-                "--pixel chooses the observation maps that --figures shows",
-                hint="Add --figures and --method spline-net",
-            )
+            problem = "--pixel chooses the observation maps that --figures shows"
+            raise UsageError(problem, hint="Add --figures and --method spline-net")
         _ = self.protocols
 
     @property
@@ -345,9 +308,9 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
 
     sources: Annotated[tuple[Path, ...], Option("Arguments", "SOURCE",
         "Captures with ground truth, folders of them, CyclesPS trees.", repeated=True)] = ()
-    as_stored: AsStored = False
-    white_level: WhiteLevel = None
-    update: Update = False
+    as_stored: shared.AsStored = False
+    white_level: shared.WhiteLevel = None
+    update: shared.Update = False
     scenes: Annotated[Natural, Option("Scenes", "N", "Render N random scenes.")] = 0
     meshes: Annotated[tuple[Path, ...], Option("Scenes", "FILE",
         "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.", names=("--mesh",), repeated=True)] = ()
@@ -394,7 +357,7 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     param: Annotated[tuple[str, ...], Option("Settings", "NAME=VALUE",
         "One setting, such as pixels.wall_share=0.3. May be repeated.", repeated=True)] = ()
     start_from: Annotated[str | None, Option("Settings", "NAME|FILE", "Begin with these weights.",
-        default="random weights; preset refine: spline-net", complete=complete_weights)] = None
+        default="random weights; preset refine: spline-net", complete=shared.complete_weights)] = None
     seed: Annotated[Seed | None, Option("Settings", "S", "Seed of the run.", default="0")] = None
     generator_weight: Annotated[NotNegative | None, Option("Pixels", "W",
         "Weight of generated pixels; each SET has weight 1.", default="0; 1 without SET")] = None
@@ -410,8 +373,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
         f"Folder of the run. Its files are updated every {defaults.CHECKPOINT_SECONDS} seconds.", names=OUTPUT)]
     tensorboard: Annotated[bool, Option("Output", "",
         "Also write RUN/tensorboard (needs the extra 'tensorboard').")] = False
-    quiet: Quiet = False
-    device: DeviceName = "auto"
+    quiet: shared.Quiet = False
+    device: shared.DeviceName = "auto"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -426,4 +389,4 @@ class ImportOptions(Record, frozen=True, kw_only=True):
     ne_net: Annotated[Path, Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator.")]
     output: Annotated[Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)]
     overwrite: Annotated[bool, Option("Output", "", "Replace an existing file.")] = False
-    quiet: Quiet = False
+    quiet: shared.Quiet = False

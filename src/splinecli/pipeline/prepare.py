@@ -13,14 +13,8 @@ from splinecli.pictures.maps import contact_sheet, encode_png
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.pipeline.options import PrepareOptions
-from splinecli.pixel_sets.entries import (
-    CaptureChangedError,
-    ScenePlan,
-    add_capture,
-    load_rendered,
-    name_captures,
-    save_rendered,
-)
+from splinecli.pixel_sets import entries
+from splinecli.pixel_sets.entries import CaptureChangedError, ScenePlan
 from splinecli.pixel_sets.store import MANIFEST, PixelSet, PixelSetWriter
 from splinecli.synthesis.scenes import SceneConfig
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
@@ -32,12 +26,8 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
     A capture that cannot be used is left out, and the observer receives the error; `skipped` in the summary holds the
-    reason and an exit code. Any other error stops the work; calling the function again resumes where it stopped.
-
-    Raises:
-        InputError: a mesh cannot be used.
-        OutputError: the set cannot be written, or contains a scene that was rendered with other settings.
-        UsageError: there is nothing to prepare, or the packages of the extra `render` are not installed.
+    reason and an exit code. Any other error stops the work, and calling the function again resumes it: InputError for a
+    mesh, OutputError, also for a scene with other settings in the set, or UsageError if there is nothing to prepare.
     """
     output, config = options.output, SceneConfig()
     config = replace(config, size=options.size or config.size, lights=options.n_lights or config.lights)
@@ -51,19 +41,13 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     with held_folder(output, observer.warn):
         writer = PixelSetWriter(output)
         plan.check_set(writer)
-        named = name_captures(captures, writer)
+        named = entries.name_captures(captures, writer)
         with observer.progress("preparing", len(named) + len(plan.names)) as advance:
             skipped: list[dict[str, Any]] = []
+            how: dict[str, Any] = {"as_stored": options.as_stored, "white_level": options.white_level}
             for name, folder in named.items():
                 try:
-                    add_capture(
-                        writer,
-                        name,
-                        folder,
-                        as_stored=options.as_stored,
-                        white_level=options.white_level,
-                        update=options.update,
-                    )
+                    entries.add_capture(writer, name, folder, update=options.update, **how)
                     observer.say(writer.describe(name))
                 except (InputError, CaptureChangedError, OSError) as refused:
                     error = as_splinecli_error(refused, folder) if isinstance(refused, OSError) else refused
@@ -132,7 +116,7 @@ def _render_scenes(
                     shape = rendered[position]
                     if isinstance(shape, str):
                         path = _path(writer.folder, position)
-                        plan.add(writer, position, shape, load_rendered(path))
+                        plan.add(writer, position, shape, entries.load_rendered(path))
                         path.unlink()
                     if not isinstance(shape, LostError):
                         finish(position)
@@ -153,5 +137,5 @@ def _render(plan: ScenePlan, folder: Path, position: int) -> str:
     """Render a scene on a worker, write it to its hidden file, and return its shape."""
     plan.check_inputs()
     shape, pixels = plan.render(position)
-    save_rendered(pixels, _path(folder, position))
+    entries.save_rendered(pixels, _path(folder, position))
     return shape

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from splinecli.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, rende
 from splinecli.synthesis.shapes import draw_view, read_relief
 from splinecli.system.files import file_sha256, free_name, replacing
 from splinecli.system.machine import import_extra
-
-if TYPE_CHECKING:
-    from splinecli.capture import Capture, CaptureSource
 
 
 class CaptureChangedError(OutputError):
@@ -59,18 +56,12 @@ def add_capture(
     """Read a capture and write its pixels with ground truth, unless the set has them.
 
     For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains on them at half
-    resolution.
+    resolution. By default, saturated observations, from `white_level` if it is given, are restored and unknown light
+    intensities are estimated, as `infer` does; `as_stored` leaves the values unchanged. `update` replaces an entry
+    whose capture changed.
 
-    Args:
-        as_stored: use the stored values unchanged. By default, saturated observations are restored and unknown light
-            intensities are estimated, as `infer` does.
-        white_level: stored value from which a pixel is considered saturated; None to estimate it from the images.
-        update: replace an entry whose capture changed.
-
-    Raises:
-        InputError: the capture cannot be read, or has no ground truth.
-        CaptureChangedError: the capture changed since its entry was created, and `update` is not set.
-        OutputError: the entry cannot be written.
+    Raises InputError if the capture cannot be read, or has no ground truth; CaptureChangedError if it changed since its
+    entry was created, and `update` is not set; OutputError if the entry cannot be written.
     """
     source = open_capture(folder, white_level=white_level)
     recipe: dict[str, Any] = {
@@ -98,14 +89,7 @@ def add_capture(
             raise CaptureChangedError(problem, path=folder, hint=hint)
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
-    pixels = _pixels(source.read(as_stored=as_stored), source, folder)
-    # All materials of a CyclesPS object have the same shape.
-    scene = source.files.folder.absolute().name if source.files.boundaries else name
-    writer.add(name, scene, str(folder), recipe, pixels)
-
-
-def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
-    """Return the pixels of a capture with ground-truth normals. Raises InputError if there are none."""
+    capture = source.read(as_stored=as_stored)
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
     # The PRPS images of CyclesPS are used at half resolution.
@@ -116,19 +100,14 @@ def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
         raise InputError("no pixel of the mask has a ground-truth normal", path=folder)
     mask = np.zeros_like(capture.mask)
     mask[capture.mask] = used
-    return Pixels(
-        observations=capture.observations[used],
-        normals=normals[used].astype(np.float32),
-        light_directions=capture.light_directions.astype(np.float32),
-        mask=mask[::step, ::step],
-    )
+    directions = capture.light_directions.astype(np.float32)
+    pixels = Pixels(capture.observations[used], normals[used].astype(np.float32), directions, mask[::step, ::step])
+    # All materials of a CyclesPS object have the same shape.
+    scene = source.files.folder.absolute().name if source.files.boundaries else name
+    writer.add(name, scene, str(folder), recipe, pixels)
 
 
 RENDERER = 5  # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
-
-# Meshes have their own random streams, so that adding a mesh does not change any other scene.
-_FIRST_MESH_INDEX = 1_000_000
-_VIEWS = 10_000  # difference between the numbers of consecutive views of a mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +134,7 @@ class ScenePlan:
         if not self.views:
             return tuple(named)
         views = range(self.views)
-        return tuple((path, f"{name}-view{n:03}", mesh + _VIEWS * n) for n in views for path, name, mesh in named)
+        return tuple((path, f"{name}-view{n:03}", mesh + 10_000 * n) for n in views for path, name, mesh in named)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -216,7 +195,7 @@ class ScenePlan:
         index = position - len(self._of_mesh)
         if index < 0:
             mesh_file, _, number = self._of_mesh[position]
-            index = _FIRST_MESH_INDEX + number
+            index = 1_000_000 + number  # of its own random stream, so that a mesh does not change any other scene
             mesh = read_mesh(mesh_file)
             if self.views:
                 others = tuple(path for path in self.meshes if path != mesh_file)
@@ -234,15 +213,13 @@ class ScenePlan:
         observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
         return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
 
-    def _shape_name(self, position: int) -> str:
-        """Return the name common to all views of a mesh, which are all used for training or all for validation."""
-        return self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
-
     def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
         """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
         recipe = self.recipe(position)
+        # All views of a mesh have one name, because all are used for training or all for validation.
+        scene = self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
         for kind, name in self.entry_names(position).items():
-            writer.add(name, self._shape_name(position), f"rendered: {shape}", recipe, pixels[kind])
+            writer.add(name, scene, f"rendered: {shape}", recipe, pixels[kind])
 
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:

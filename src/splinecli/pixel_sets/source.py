@@ -16,10 +16,6 @@ from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
 from splinecli.synthesis.whole_capture import photograph_captures
 
-# Memory-mapped arrays are closed after this many bytes have been read, so that their pages can be freed.
-_MAPPED_BYTES = 128 << 20
-# The operating system reads this many bytes when a page is first accessed.
-_READ_AHEAD_BYTES = 64 << 10
 FILL_ROUNDS = 3  # each round extends one cell further from the cells with a light
 
 
@@ -133,8 +129,9 @@ class PixelSetSource:
             directions[here, : entry.n_lights] = entry_directions
             known[here, : entry.n_lights] = True
             normals[here] = entry_normals[rows]
-            self._bytes_read += len(rows) * (_READ_AHEAD_BYTES + observations[0].nbytes)
-        if self._bytes_read > _MAPPED_BYTES:
+            # The operating system reads 64 kB when a page is first accessed.
+            self._bytes_read += len(rows) * ((64 << 10) + observations[0].nbytes)
+        if self._bytes_read > 128 << 20:  # close memory-mapped arrays, so that their pages can be freed
             self._observations, self._bytes_read = {}, 0
         return SampledPixels(*(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known)))
 

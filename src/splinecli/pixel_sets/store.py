@@ -199,12 +199,7 @@ class PixelSetWriter:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open the folder.
-
-        Raises:
-            OutputError: the folder cannot be written, or contains other files.
-            InputError: its manifest is damaged.
-        """
+        """Open the folder. Raises OutputError if it cannot be written or has other files; InputError if damaged."""
         check_writable(folder)
         self.folder = folder
         self._entries: dict[str, Entry] = {}

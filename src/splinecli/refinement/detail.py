@@ -25,7 +25,6 @@ from splinecli.refinement.tiles import Box, pixels_before
 from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
-
 _DARK = 1e-6  # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 
 
@@ -37,22 +36,17 @@ class HalfCapture:
     observations: Floats  # (Q, F)
     normals: Floats  # (Q, 3), unit, in the capture's frame
     errors: Floats  # (Q, 2)
-    members: (
-        PixelIndices  # (Q,), the row of one pixel of each block in the other capture; its lights hold for the block
-    )
+    members: PixelIndices  # (Q,), the row in the other capture of one pixel of each block, whose lights hold for it
     whole: LightingAt  # gives the light of the other capture's pixels
 
     @classmethod
     def of(
         cls, mask: NDArray[np.bool_], lighting_at: LightingAt, normals: Floats, errors: Floats, reference: float
     ) -> HalfCapture:
-        """Return half of a capture.
+        """Return half of a capture with a mask (H, W), both even, of P true pixels, and the brightness `reference`.
 
-        Args:
-            mask: (H, W), both even, with P true pixels.
-            lighting_at: gives the observations and light directions of some pixels.
-            normals, errors: (P, 3) and (P, 2), in the capture's frame.
-            reference: the brightness of the capture.
+        `lighting_at` gives the observations and light directions of some pixels. The normals (P, 3) and errors (P, 2)
+        are in the capture's frame.
         """
         half = _over_blocks(np.logical_or, mask)
         rows_above, done_above = pixels_before(mask), pixels_before(half)
@@ -127,11 +121,6 @@ FINE = 1.5  # detail is the part that a Gaussian filter with this sigma in pixel
 WINDOW = 3.0  # detail is compared in a Gaussian window with this sigma in pixels
 REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
 FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show noise well
-
-_LEAST_REAL, _SURELY_REAL = 0.7, 0.9
-"""Share of the missing detail's energy that is signal. Below the first number nothing is restored, above the second
-all."""
-
 _TINY = 1e-12
 
 
@@ -142,13 +131,9 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
     clearly larger than its noise, and to the extent that both agree. Images that are shifted towards their lights, by
     half a pixel for example, have the same effect as detail.
 
-    Args:
-        refined, estimated, least_squares: (3, H, W), unit normals. At least FEWEST_LIGHTS lights gave the last ones.
-        noise: (1, H, W), of least squares; see fits/least_squares.py.
-        mask: (1, H, W), 1 inside, else 0. The other maps are zero outside.
-
-    Returns:
-        Unit normals (3, H, W), zero outside the mask. Black pixels stay as they are.
+    All normals (3, H, W) are unit; at least FEWEST_LIGHTS lights gave those of least squares, and the noise (1, H, W)
+    is theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0, and the other maps are zero outside,
+    as is the result. Black pixels stay as they are.
     """
     mask = mask * least_squares.any(dim=0)  # black pixels carry no information
     removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
@@ -163,15 +148,11 @@ def restore_octave(
 
     Detail is the part of the normals that is lost when they are halved, as by HalfCapture, and enlarged again (Burt and
     Adelson, The Laplacian pyramid as a compact image code, 1983). It is considered real where the detail of least
-    squares is clearly larger than its noise.
+    squares is clearly larger than its noise. Bright pixels get more weight than dark ones, by their largest observation
+    (1, H, W).
 
-    Args:
-        enlarged: (3, H, W), unit, from half the resolution.
-        estimated, least_squares, noise, mask: see restore_detail. The maps begin at even rows and columns.
-        largest: (1, H, W), the largest observation of each pixel. Bright pixels get more weight than dark ones.
-
-    Returns:
-        Unit normals (3, H, W), zero outside the mask.
+    The enlarged normals (3, H, W) are unit, as is the result, which is zero outside the mask. See restore_detail for
+    the other arguments. The maps begin at even rows and columns.
     """
     mask = mask * least_squares.any(dim=0)
     largest = largest * mask
@@ -183,7 +164,8 @@ def restore_octave(
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:
     """Return the share (H, W) of missing detail (3, H, W) to restore, given the noise (1, H, W) in it."""
     real = 1 - _energy(noise, noise) / _energy(missing, missing)
-    return ((real - _LEAST_REAL) / (_SURELY_REAL - _LEAST_REAL)).clamp(0, 1)
+    # Nothing is restored below 0.7, and everything above 0.9.
+    return ((real - 0.7) / (0.9 - 0.7)).clamp(0, 1)
 
 
 def _energy(one: Tensor, other: Tensor) -> Tensor:

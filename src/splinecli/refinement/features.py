@@ -9,18 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.fits.least_squares import (
-    LAMBERTIAN_SHADOW_SHARE,
-    TwoHalves,
-    compare_halves,
-    fit_lambertian,
-    weighted_sum,
-)
+from splinecli.fits import least_squares
+from splinecli.fits.least_squares import TwoHalves, weighted_sum
 from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
-
-_LARGEST_LOG = 4.0
-_HALVES_SCALE = 3.0  # scales these small numbers to the range of the others
 
 
 @torch.no_grad()
@@ -34,18 +26,14 @@ def refine_features(
 ) -> Tensor:
     """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to 1.
 
-    Args:
-        observations: (P, F), linear, divided by the light intensities.
-        light_directions: (F, 3) or (P, F, 3), unit.
-        normals: (P, 3), unit.
-        error: (P, 2), see networks/li_ne_net.py.
-        reference: the brightness of the capture, see `brightness`.
-        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/least_squares.py.
+    The observations (P, F) are linear, divided by the light intensities. The light directions (F, 3) or (P, F, 3) and
+    the normals (P, 3) are unit. See networks/li_ne_net.py for the error (P, 2), `brightness` for the reference, and
+    alternating_signs of fits/least_squares.py for the signs (F,), the halves of the capture's lights.
     """
     scale = map_scale(observations)
     observed = observations / scale
     count = observed.shape[1]
-    robust = torch.nn.functional.normalize(fit_lambertian(observed, light_directions), dim=-1)
+    robust = torch.nn.functional.normalize(least_squares.fit_lambertian(observed, light_directions), dim=-1)
     plain, change, noise = two_halves(observed, light_directions, signs)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.
@@ -65,13 +53,13 @@ def refine_features(
         "light_moments": moments[..., 2:].expand(len(observed), -1),
         "error_median": error[:, :1] + MEDIAN_OFFSET,
         "error_shape": error[:, 1:] - 1,
-        "largest": (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
+        "largest": (scale / reference).log().clamp(-4.0, 4.0) / 2,
         "mean": level,
         "deviation": ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
         "residual": 3 * (unexplained.square() @ mean).sqrt(),
-        "dark_share": (observed < LAMBERTIAN_SHADOW_SHARE).to(observed.dtype) @ mean,
+        "dark_share": (observed < least_squares.LAMBERTIAN_SHADOW_SHARE).to(observed.dtype) @ mean,
         "n_lights": torch.full_like(scale, math.log(count / 10)),
-        "halves": (_HALVES_SCALE * change).clamp(-1, 1),
+        "halves": (3.0 * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
     }
     return torch.cat([features[name] for name in FEATURE_WIDTHS], dim=1)
@@ -79,7 +67,7 @@ def refine_features(
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
     """Return compare_halves in double precision, from observations (P, F) with a largest value of 1."""
-    found = compare_halves(observed.double(), light_directions.double(), signs)
+    found = least_squares.compare_halves(observed.double(), light_directions.double(), signs)
     return TwoHalves(*(values.to(observed) for values in found))
 
 

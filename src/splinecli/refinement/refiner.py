@@ -26,17 +26,13 @@ from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles,
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress
 
+# Pixels around a tile that the nets use as context, a multiple of COARSEST. Two nets reach further (RefineNet's
+# `reach`), but context beyond the margin changes no normal by more than 0.01 degrees. A margin of 64, which is enough
+# for one net, leaves visible seams with two.
 MARGIN = 112
-"""Pixels around a tile that the nets use as context, a multiple of COARSEST.
-
-Two nets reach further (RefineNet's `reach`), but context beyond the margin changes no normal by more than 0.01
-degrees. A margin of 64, which is enough for one net, leaves visible seams with two.
-"""
-
+# Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin. Larger tiles take
+# less time, because their margins are smaller in total, but more memory.
 TILE = 512
-"""Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin.
-
-Larger tiles take less time, because their margins are smaller in total, but more memory."""
 
 MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at full resolution
 
@@ -63,13 +59,10 @@ class _Capture:
 class NetworkRefiner:
     """Corrects a capture's normals, and the distributions of their errors, using the neighbourhood of each pixel.
 
-    Args:
-        network: one refinement net or two, on their device.
-        precision: the number format of the convolutions.
-        turns: the results of this many quarter turns of the map are averaged. Adding mirror images does not help.
-        tile, margin: see TILE and MARGIN. With a margin of the net's `reach`, tiles change nothing.
-        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real, so the net
-            processes their maps at full resolution: more pixels, but once instead of in all turns.
+    The network is one refinement net or two, on their device, and `precision` the number format of the convolutions.
+    The results of `turns` quarter turns of the map are averaged; adding mirror images does not help. With a margin of
+    the net's `reach`, tiles change nothing. Captures of fewer than FEWEST_LIGHTS do not show which detail is real, so
+    the net processes their maps at full resolution: more than MOST_PIXELS, but once instead of in all turns.
     """
 
     network: RefineNet
@@ -97,14 +90,10 @@ class NetworkRefiner:
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
-        A pixel that is dark under every light stays as it is. See networks/li_ne_net.py for the distributions.
-
-        Args:
-            mask: (H, W), with P true pixels.
-            observations: (P, F); only their brightness is used here.
-            lighting_at: gives the observations and the light directions of some pixels.
-            normals, errors: of the estimator, in the capture's frame.
-            progress: called after each tile with the number of its pixels.
+        They are the estimator's, in the capture's frame; see networks/li_ne_net.py for the distributions. A pixel that
+        is dark under every light stays as it is. The mask (H, W) has P true pixels. Only the brightness of the
+        observations (P, F) is used here: `lighting_at` gives the observations and the light directions of some pixels.
+        `progress` is called after each tile with the number of its pixels.
         """
         middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
         of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))

@@ -26,9 +26,7 @@ class Tile:
 class Band:
     """The refined normals and errors of a row of tiles, until the tiles below no longer need those from before.
 
-    Args:
-        pixels: the rows of these pixels in the capture, which follow one another.
-        normals, errors: (P, 3) and (P, 2) of the whole capture.
+    The pixels follow one another in the capture, of which the normals (P, 3) and errors (P, 2) are.
     """
 
     def __init__(self, pixels: slice, normals: Floats, errors: Floats) -> None:
@@ -49,9 +47,7 @@ class Band:
 def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[tuple[slice, Iterator[Tile]]]:
     """Yield the pixels of each row of tiles, and its tiles that have pixels.
 
-    Args:
-        mask: (H, W), multiples of COARSEST.
-        tile, margin: the side of a tile, and the width of the context around it, multiples of COARSEST.
+    The sides of the mask (H, W) and of a tile, and the context around it, are multiples of COARSEST.
     """
     above = pixels_before(mask)
     for top in range(0, mask.shape[0], tile):
@@ -66,7 +62,6 @@ def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[t
 def _tiles_of_band(
     mask: NDArray[np.bool_], rows: NDArray[np.integer], band: slice, inside: slice, tile: int, margin: int
 ) -> Iterator[Tile]:
-    """Yield the tiles of a band of the map; `inside` are its rows without the margin."""
     for left in range(0, mask.shape[1], tile):
         outer = slice(max(0, left - margin), min(left + tile + margin, mask.shape[1]))
         inner = inside, slice(left - outer.start, left - outer.start + tile)

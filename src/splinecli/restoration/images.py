@@ -23,19 +23,9 @@ from splinecli.errors import InputError, UsageError
 from splinecli.fits.robust import absolute_weights, fit_scaled_normals, shade, shadow_weights
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 
-ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
-
-RAISED_WEIGHT = np.float32(0.1)
-"""Weight of an observation that the last fit raised; one that the fit meets has 50. It only affects pixels that the
-others leave undetermined."""
-
-MAX_BRIGHTENING = 8.0  # no observation is restored to more than this many times the pixel's brightest stored one
-
-_TILE_PIXELS = 8192
-
+# From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
+# pixel shows.
 LightsOf = Callable[[Integers], Float64Array]
-"""From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
-pixel shows."""
 
 
 def find_saturated(pixels: Array) -> Bools:
@@ -57,16 +47,13 @@ def restore_saturated(observations: Float32Array, saturated: Bools, lights: Floa
     to the pixel (least absolute deviations by reweighting) or the stored value, whichever is brighter. The fit is
     repeated on the restored values, so a saturated observation can only raise it. Without this, a pixel would either
     lose its brightest observations, or its normal would tilt towards the mean of the lights (figures in
-    docs/measurements.md). Pixels that are saturated under every light stay as they are.
-
-    Args:
-        saturated: (P, F).
-        lights: unit light directions (F, 3), or see LightsOf.
+    docs/measurements.md). Pixels that are saturated under every light stay as they are. The lights are unit directions
+    (F, 3), or see LightsOf.
     """
     everywhere = np.asarray(saturated.all(axis=1))
     rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)
-    for start in range(0, len(rows), _TILE_PIXELS):
-        tile = rows[start : start + _TILE_PIXELS]
+    for start in range(0, len(rows), 8192):
+        tile = rows[start : start + 8192]
         own = lights(tile) if callable(lights) else lights
         observations[tile] = _restored(observations[tile], saturated[tile], own.astype(np.float32))
     return saturated & ~everywhere[:, None] if len(rows) else None
@@ -77,32 +64,22 @@ def _restored(stored: Float32Array, saturated: Bools, lights: Float32Array) -> F
     scale[scale <= 0] = 1
     values = lowest = stored / scale
     weights = lit = shadow_weights(lowest)
-    for _ in range(ITERATIONS):
+    for _ in range(16):  # more fits change the restored values by less than the fit's own error
         predicted = shade(fit_scaled_normals(values, weights, lights), lights)
         residuals = predicted - lowest
         raised = saturated & (residuals > 0)
-        values = np.where(raised, np.minimum(predicted, MAX_BRIGHTENING), lowest)
-        weights = lit * np.where(raised, RAISED_WEIGHT, absolute_weights(residuals))
+        # No observation is restored to more than eight times the pixel's brightest stored one.
+        values = np.where(raised, np.minimum(predicted, 8.0), lowest)
+        # An observation that the fit meets has a weight of 50; raised ones only matter if the others do not suffice.
+        weights = lit * np.where(raised, np.float32(0.1), absolute_weights(residuals))
     # Rounding must not make a value darker than stored.
     return np.asarray(np.where(saturated, np.maximum(values * scale, stored), stored))
 
 
 Origin = Literal["given", "file", "images", "full scale"]
 
-FEWEST_IMAGES = 3  # an image is considered clipped at the common maximum only if so many images reach it
-FEWEST_IMAGES_AT_BITS = 2  # or this many, if the maximum is the largest number of 8 to 15 bits
-
-FEWEST_PIXELS, SMALLEST_SHARE = 3, 1e-4
-"""An image reaches the maximum at no fewer pixels, and at no smaller share of the pixels."""
-
 COMPARED_VALUES = 16  # number of different values below the maximum whose observations are counted
-
-LOWEST_COMPARED = 0.5
-"""They must not be smaller than this share of the maximum: clipping cuts through a continuous range of values."""
-
-SPIKE = 5  # the maximum occurs at least this many times as often as any of the compared values
-
-_BLOCK, _NEAR = 1 << 20, 1 << 10
+_BLOCK = 1 << 20
 _FULL_SCALE_16_BIT = 65_535
 
 
@@ -139,7 +116,7 @@ class ImageValues(NamedTuple):
     saturated: Integers  # the pixels at the given white level or above, or at full scale if none is given
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
     at_maximum: Integers = _NOTHING  # the pixels with this value
-    # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
+    # the largest values below the maximum, at most COMPARED_VALUES and none below half of it
     below: NDArray[np.int64] = _NOTHING
     counts: NDArray[np.int64] = _NOTHING  # how often each of these values occurs
 
@@ -230,10 +207,10 @@ class Saturation:
     def _is_clipped(self, maximum: int) -> bool:
         """Return whether 16-bit images look clipped at their common maximum."""
         images = [image for image in self.images if image.maximum == maximum]
-        fewest_pixels = max(FEWEST_PIXELS, SMALLEST_SHARE * self.n_pixels)
+        fewest_pixels = max(3, 1e-4 * self.n_pixels)
         reaching = [image.at_maximum for image in images if len(image.at_maximum) >= fewest_pixels]
         even_at_bits = self.even and _is_bits(maximum)
-        fewest = 1 if even_at_bits else FEWEST_IMAGES_AT_BITS if _is_bits(maximum) else FEWEST_IMAGES
+        fewest = 1 if even_at_bits else 2 if _is_bits(maximum) else 3  # images that reach a common maximum
         if len(reaching) < fewest:
             return False
         # A flat background has one value under all lights. Clipped pixels are bright under some lights only.
@@ -245,18 +222,14 @@ class Saturation:
             return False
         counts = np.zeros(len(below), np.int64)
         np.add.at(counts, places, np.concatenate([image.counts for image in images]))
-        return number >= SPIKE * int(counts[-COMPARED_VALUES:].max(initial=0))
+        return number >= 5 * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
 def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
     """Return the values that decide which of an image's pixels (P, C), as stored, are saturated.
 
-    Args:
-        given: the white level that the user gave; None to find it.
-        stated: the white level that the file states, 2^bits - 1 for a number of bits; None if it states none.
-
-    Raises:
-        InputError: the white level that the user gave is above the image's full scale.
+    `given` is the white level that the user gave, None to find it; `stated` the one that the file states, 2^bits - 1
+    for a number of bits, None if it states none. Raises InputError if the given one is above the image's full scale.
     """
     full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
     if given is not None:
@@ -279,10 +252,10 @@ def _indices(flags: Bools) -> Integers:
 
 def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
-    lowest_compared = math.ceil(LOWEST_COMPARED * maximum)
+    lowest_compared = math.ceil(0.5 * maximum)  # clipping cuts through a continuous range of values
     values = pixels.reshape(-1)
     # Few values are near the maximum. The others are counted only if these are not enough.
-    for lowest in (max(lowest_compared, maximum - _NEAR), lowest_compared):
+    for lowest in (max(lowest_compared, maximum - 1024), lowest_compared):
         counts = np.zeros(maximum + 1 - lowest, np.int64)
         for start in range(0, len(values), _BLOCK):
             block = values[start : start + _BLOCK]
@@ -298,24 +271,15 @@ def _is_bits(level: int) -> bool:
     return any(level in ((1 << bits) - 1, ((1 << bits) - 1) << (16 - bits)) for bits in range(8, 16))
 
 
-LEAST_BORDER, LEAST_HOLE, LEAST_BRIGHT = 0.95, 0.05, 0.5
-"""A mask is probably inverted if it has this share of the picture's border, excludes this share of the picture, and the
-excluded pixels are at least this bright relative to the rest. Holes of objects are dark."""
-
-_SMALLEST, _LARGEST = 0.005, 0.98  # smallest and largest share of the picture that an object can cover
-
-
 def surrounds_hole(mask: Bools) -> bool:
     """Return whether a mask (H, W) has the border of the picture, and leaves out a part of its middle."""
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
-    return bool(border.mean() >= LEAST_BORDER and LEAST_HOLE <= 1 - mask.mean() < 1)
+    return bool(border.mean() >= 0.95 and 0.05 <= 1 - mask.mean() < 1)
 
 
 def looks_inverted(mask: Bools, brightness: Float32Array) -> bool:
     """Return whether a mask (H, W) surrounds a hole that is not dark in the picture's brightness (H, W)."""
-    if not surrounds_hole(mask):
-        return False
-    return bool(np.median(brightness[~mask]) > LEAST_BRIGHT * np.median(brightness[mask]))
+    return surrounds_hole(mask) and bool(np.median(brightness[~mask]) > 0.5 * np.median(brightness[mask]))
 
 
 def find_object(brightness: Float32Array) -> Bools:
@@ -323,14 +287,9 @@ def find_object(brightness: Float32Array) -> Bools:
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube
     root of brightness, in which dark parts of an object are closer to its bright parts than to the background. The mask
-    is the largest connected area above it, with its holes filled. This fails if the background is as bright as
-    the object.
-
-    Args:
-        brightness: (H, W), linear: the mean over all lights.
-
-    Raises:
-        InputError: nearly nothing is brighter than the background, or nearly everything is.
+    is the largest connected area above it, with its holes filled. This fails if the background is as bright as the
+    object. The brightness (H, W) is linear: the mean over all lights. Raises InputError if nearly nothing is brighter
+    than the background, or nearly everything is.
     """
     import cv2
 
@@ -345,7 +304,7 @@ def find_object(brightness: Float32Array) -> Bools:
     outline, _ = cv2.findContours((labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     mask = cv2.drawContours(np.zeros(brightness.shape, np.uint8), outline, -1, 1, cv2.FILLED) > 0
     share = float(mask.mean())
-    if not largest or not _SMALLEST <= share <= _LARGEST:
+    if not largest or not 0.005 <= share <= 0.98:
         problem = f"no mask was found: the area brighter than the background covers {100 * share:.1f} % of the picture"
         raise InputError(problem, hint="Paint a mask, white on the object, and pass it with --mask FILE")
     return np.asarray(mask)

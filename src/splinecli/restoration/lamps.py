@@ -13,7 +13,6 @@ channel is divided by its own.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli import capture_warnings as codes
 from splinecli.capture_warnings import CaptureWarning
@@ -23,37 +22,14 @@ from splinecli.maths.normals import spread_of, unit
 
 Lights = Float64Array | Callable[[Integers], Float64Array]
 
+# Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
+# wrong.
 MIN_LIGHTS = 6
-"""Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
-wrong."""
-
+# Normals with a smaller spread (their second largest standard deviation) belong to a flat object, such as a coin or a
+# painting. Tilting all its normals together has the same effect as other intensities, so the likeliest tilt is used.
 FLAT_SPREAD = 0.35
-"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, such as a coin or a
-painting. Tilting all its normals together has the same effect as other intensities, so the likeliest tilt is used."""
-
 TILT = 0.09  # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
-_TRUSTED_TILTS = 1.5  # times TILT: if equal intensities tilt a flat object by less than that, they are kept
-MAX_ERROR_RATIO = 0.35  # largest accepted residual, as a share of the residual under equal intensities
-
-MAX_ERROR = 0.035
-"""Largest accepted residual: the median, as a share of a pixel's brightest observation. Metals have more."""
-
-MIN_EQUAL_ERROR = 0.02
-"""Smallest residual under equal intensities for which others are estimated, in the unit of MAX_ERROR.
-
-These limits were tried on DiLiGenT's Ball and Cat without their measured intensities, PSBox's cat and the medallion.
-With six lights, 45 of 48 draws are recognised as unequal; with eight or ten lights, all 85 are. Of 180 draws from uw's
-sphere and horse and from path-traced objects, with metals and bowls among them, none is. The error of ten intensities
-is 1.6 % on Ball and 2.9 % on Cat; of six intensities, it is 4 and 7 %. Equal intensities would have an error of 46 %.
-"""
-
-_MAX_ROUNDS, _FITS_PER_ROUND = 200, 5
-_MAX_OBSERVATIONS, _MIN_PIXELS, _MAX_PIXELS = 100_000, 100, 2000
-_DARK_SHARE = 0.1  # of the brightest hundredth of the pixels
-_LIT_SHARE = 0.3  # of a pixel's brightest prediction; darker observations may be shadows
-_TILT_FITS, _LOWEST_COSINE, _LEAST_VARIANCE = 5, 0.05, 1e-4
-_STEP = 1.5  # exponent of each round's change; beyond 1 it saves a third of the rounds
-_CONVERGED = 1e-4  # change of the logarithms
+_LOWEST_COSINE, _LEAST_VARIANCE = 0.05, 1e-4
 
 
 def estimate_light_intensities(
@@ -61,64 +37,64 @@ def estimate_light_intensities(
 ) -> Float64Array | None:
     """Return light intensities (F,) with a mean of 1, or None if equal ones fit or the images do not determine them.
 
-    Args:
-        observations: (P, F), not divided by intensities.
-        missing: (P, F), observations to leave out, such as saturated ones.
-        lights: (F, 3), or a function from rows (p,) to (p, F, 3), as under near lamps.
+    The observations (P, F) are not divided by intensities; `missing` (P, F) are left out, such as saturated ones. The
+    lights are (F, 3), or a function from rows (p,) to (p, F, 3), as under near lamps.
+
+    The limits below were tried on DiLiGenT's Ball and Cat without their measured intensities, PSBox's cat and the
+    medallion. With six lights, 45 of 48 draws are recognised as unequal; with eight or ten lights, all 85 are. Of 180
+    draws from uw's sphere and horse and from path-traced objects, with metals and bowls among them, none is. The error
+    of ten intensities is 1.6 % on Ball and 2.9 % on Cat; of six, it is 4 and 7 %; of equal ones, it would be 46 %.
     """
-    chosen = _choose_pixels(observations, missing)
-    if chosen is None:
+    n_lights = observations.shape[1]
+    if n_lights < MIN_LIGHTS:
         return None
-    rows, values, known = chosen
+    rows, values = lit_values(observations, 0.1, min(2000, 100_000 // n_lights))
+    known = np.ones(values.shape, np.bool_) if missing is None else ~missing[rows]
+    enough = known.sum(axis=1) >= MIN_LIGHTS
+    if enough.sum() < 100:
+        return None
+    rows, values, known = rows[enough], values[enough], known[enough]
     light_vectors = lights(rows) if callable(lights) else lights
     equal = np.ones(values.shape[1])
     equal_error = _error(values, shade(_fit(values, known, equal, light_vectors), light_vectors), known)
-    if equal_error <= MIN_EQUAL_ERROR:
+    if equal_error <= 0.02:
         return None
     intensities = _alternate(values, known, light_vectors)
     if intensities is None:
         return None
     normals = _fit(values, known, intensities, light_vectors)
-    if _equal_are_better(intensities, unit(normals), light_vectors):
-        return None
+    if spread_of(unit(normals)) < FLAT_SPREAD:
+        # A flat object may be nearer to its tilt under equal intensities than to the likeliest tilt.
+        directions, shown = _shown(intensities, unit(normals), light_vectors)
+        tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
+        slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
+        tilt_error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
+        if tilt_error < 2 * (1.5 * TILT) ** 2:
+            return None
     predicted = shade(normals, light_vectors)
     error = _error(values / intensities, predicted, known)
-    return intensities if error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR) else None
-
-
-def _choose_pixels(
-    observations: Float32Array, missing: Bools | None
-) -> tuple[NDArray[np.intp], Float64Array, Bools] | None:
-    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them to use.
-
-    Returns None for too few.
-    """
-    n_lights = observations.shape[1]
-    if n_lights < MIN_LIGHTS:
-        return None
-    chosen, values = lit_values(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
-    known = np.ones(values.shape, np.bool_) if missing is None else ~missing[chosen]
-    enough = known.sum(axis=1) >= MIN_LIGHTS
-    return (chosen[enough], values[enough], known[enough]) if enough.sum() >= _MIN_PIXELS else None
+    return intensities if error < min(0.35 * equal_error, 0.035) else None  # metals have a larger error
 
 
 def _alternate(values: Float64Array, known: Bools, lights: Float64Array) -> Float64Array | None:
     """Return the intensities (F,) at which fits and medians agree; None if a light reaches too few pixels."""
     intensities = np.ones(values.shape[1])
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(200):
         scaled_normals = _fit(values, known, intensities, lights)
         predicted = shade(scaled_normals, lights)
-        counts = known & (predicted > _LIT_SHARE * predicted.max(axis=1, keepdims=True))
+        # Darker observations may be shadows.
+        counts = known & (predicted > 0.3 * predicted.max(axis=1, keepdims=True))
         if (counts.sum(axis=0) < 10).any():
             return None
         ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
         medians: Float64Array = np.nanmedian(ratios, axis=0)
         if not (medians > 0).all():
             return None
-        before, intensities = intensities, intensities * (medians / intensities) ** _STEP
+        # An exponent beyond 1 saves a third of the rounds.
+        before, intensities = intensities, intensities * (medians / intensities) ** 1.5
         intensities = _likeliest_tilt(intensities, unit(scaled_normals), lights)
         intensities /= intensities.mean()
-        if np.abs(np.log(intensities / before)).max() < _CONVERGED:
+        if np.abs(np.log(intensities / before)).max() < 1e-4:
             break
     return intensities
 
@@ -145,17 +121,6 @@ def _shown(intensities: Float64Array, normals: Float64Array, lights: Float64Arra
     return directions, intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
 
-def _equal_are_better(intensities: Float64Array, normals: Float64Array, lights: Float64Array) -> bool:
-    """Return whether a flat object is nearer to its tilt under equal intensities than to the likeliest tilt."""
-    if spread_of(normals) >= FLAT_SPREAD:
-        return False
-    directions, shown = _shown(intensities, normals, lights)
-    tilt = _fit_tilt(shown, directions, _LEAST_VARIANCE)
-    slopes = directions[:, :2] - directions[:, :2].mean(axis=0)
-    error = _variance(shown, directions, tilt) * np.trace(np.linalg.pinv(slopes.T @ slopes))
-    return bool(error < 2 * (_TRUSTED_TILTS * TILT) ** 2)
-
-
 def _variance(shown: Float64Array, directions: Float64Array, tilt: Float64Array) -> float:
     """Return the variance of the log intensities that a tilt does not explain."""
     return float((_inequality(shown, directions, tilt) ** 2).sum()) / max(len(shown) - 3, 1)
@@ -170,7 +135,7 @@ def _inequality(shown: Float64Array, directions: Float64Array, tilt: Float64Arra
 def _fit_tilt(shown: Float64Array, directions: Float64Array, variance: float) -> Float64Array:
     """Return the likeliest tilt (2,) of a plane, for log intensities of this variance and tilts of variance TILT^2."""
     tilt, certainty = np.zeros(2), TILT**2 / variance
-    for _ in range(_TILT_FITS):
+    for _ in range(5):
         slopes = directions[:, :2] / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)[:, None]
         slopes = slopes - slopes.mean(axis=0)
         right = certainty * slopes.T @ _inequality(shown, directions, tilt) - tilt
@@ -183,7 +148,7 @@ def _fit(values: Float64Array, known: Bools, intensities: Float64Array, lights: 
     observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
     observed = observed / largest
-    normals, _ = fit_robustly(observed, shadow_weights(observed) * known, lights, _FITS_PER_ROUND)
+    normals, _ = fit_robustly(observed, shadow_weights(observed) * known, lights, 5)
     return np.asarray(normals * largest)
 
 
@@ -195,29 +160,16 @@ def _error(observed: Float64Array, predicted: Floats, known: Bools) -> float:
 
 COLOUR_SAMPLE = 1500  # pixels of which the colours are compared
 
-LEAST_CHANGE, MOST_SCATTER = 0.15, 0.4
-"""Smallest change of a channel against the others, as a logarithm, that is corrected, and the largest share of it by
-which the pixels may differ. White LEDs differ by 0.05. Light from other parts of the object varies over the pixels."""
-
-LEAST_CHANNEL = 0.1  # of a lamp's mean colour; a fainter channel is mostly noise
-LEAST_VARIETY, STRIPED_VARIETY = 0.05, 0.5
-"""Standard deviation over the pixels of the logarithm of a channel against the others: below the first, the object has
-one colour; at the second, it has stripes of strong colours."""
-
-UNKNOWN_ERROR_DEG = 15.0  # of striped objects under lamps of pure colours, whose colours cannot be divided out
-
-_DARK_COLOUR_SHARE = 0.15  # of the brightest hundredth of the sample, in every image
 _MIN_COLOUR_PIXELS = 50
 
 
 def lamp_colours(colours: Floats) -> tuple[Float64Array | None, list[CaptureWarning]]:
     """Return the colours (F, 3) of lamps, by which channels are to be divided, or None for equal ones; and warnings.
 
-    Args:
-        colours: (F, p, 3), linear RGB of some pixels in all images, divided by the intensities that are known.
+    The argument (F, p, 3) is linear RGB of some pixels in all images, divided by the intensities that are known.
     """
     sums = colours.sum(axis=2, dtype=np.float64)
-    lit = (sums > _DARK_COLOUR_SHARE * np.quantile(sums, 0.99)).all(axis=0)
+    lit = (sums > 0.15 * np.quantile(sums, 0.99)).all(axis=0)
     if np.count_nonzero(lit) < _MIN_COLOUR_PIXELS:
         lit = sums.min(axis=0) >= np.quantile(sums.min(axis=0), 0.7)  # some of the pixels are in shadow everywhere
     if np.count_nonzero(lit) < _MIN_COLOUR_PIXELS:
@@ -230,17 +182,18 @@ def lamp_colours(colours: Floats) -> tuple[Float64Array | None, list[CaptureWarn
     image, channel = np.unravel_index(np.abs(common).argmax(), common.shape)
     most = float(abs(common[image, channel]))
     scatter = float(np.median(np.abs(changes[image, :, channel] - common[image, channel])))
-    # An object of one colour only looks brighter under one lamp and darker under another.
     variety = float(np.median(logs.std(axis=1).max(axis=1)))
-    if most < LEAST_CHANGE or scatter > MOST_SCATTER * most or variety < LEAST_VARIETY:
+    # White LEDs differ by 0.05. Light from other parts of the object varies over the pixels. An object of one colour
+    # only looks brighter under one lamp and darker under another.
+    if most < 0.15 or scatter > 0.4 * most or variety < 0.05:
         return None, []
     found = np.exp(common)
     found /= found.mean(axis=1, keepdims=True)
     said = "The colour of the light varies from image to image"
-    if found.min() < LEAST_CHANNEL:
+    if found.min() < 0.1:  # a fainter channel is mostly noise
         text = f"{said}, and some lamps lack a colour, so it cannot be divided out. The normals of coloured objects are"
         text += " wrong. Use white lamps, or give RGB intensities with --intensities FILE."
-        error_deg = UNKNOWN_ERROR_DEG * min(1.0, variety / STRIPED_VARIETY)
+        error_deg = 15.0 * min(1.0, variety / 0.5)  # of an object with stripes of strong colours, at 0.5
         return None, [CaptureWarning(codes.LIGHT_COLOURS, text, error_deg)]
     text = f"{said}: it was estimated from the images and divided out. Use --intensities FILE if you have measured it."
     return found, [CaptureWarning(codes.ESTIMATED_COLOURS, text)]

@@ -14,27 +14,11 @@ from numpy.typing import NDArray
 
 from splinecli.maths import Bools, Float32Array, Float64Array
 
-REACH = 6
-"""Pixels around the object that the filter mixes with it, and half of the filter's side minus one."""
-
-SMALLEST_SIGMA = 0.4
-"""A narrower blur is left alone: it costs little, and its estimate is wrong by 0.1 to 0.2 pixels."""
-
+REACH = 6  # pixels around the object that the filter mixes with it, and half of the filter's side minus one
 WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
-
+# Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG.
 NOISE = 0.005
-"""Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG."""
-
-_MOST_IMAGES = 12
-_OUTLINE = 4  # pixels around the object whose steps are analysed
 _SQUARES, _SIDE = 16, 128  # a capture with more pixels is only analysed in this many squares
-_STEEP_SHARE = 0.01  # share of the local maxima of the gradient that are treated as edges
-_FEWEST_EDGES = 60
-_CORRELATION_ERROR = 0.1
-_SMOOTHEST = 0.5
-"""Correlation of gradients at a distance of three pixels above which the images show shading alone, and no edge. No
-blur of up to WIDEST_SIGMA reaches it."""
-_THREADS = 2
 
 # benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and the coefficients of
 # a quadratic polynomial of the five.
@@ -60,23 +44,20 @@ def _grown(mask: Bools, reach: int) -> Bools:
 def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float | None:
     """Sharpen observations in place; return the estimated blur, or None if it is negligible.
 
-    Args:
-        observations: (P + R, F), of the P pixels of a mask (H, W), then of the R pixels around it, which keep their
-            values.
-        around: (H, W), see surroundings.
-
-    Returns:
-        The standard deviation of the blur along either axis, in pixels.
+    The observations (P + R, F) are of the P pixels of a mask (H, W), then of the R pixels around it (H, W), which keep
+    their values; see surroundings. The blur is its standard deviation along either axis, in pixels.
     """
     import cv2
 
     rows, n_pixels = pixel_rows(mask, around), np.count_nonzero(mask)
     numbers = edge_numbers(observations, mask, rows)
-    if numbers is None or numbers[-1] > _SMOOTHEST:
+    # A higher correlation of gradients at a distance of three pixels shows shading alone, and no edge. No blur of up to
+    # WIDEST_SIGMA reaches it.
+    if numbers is None or numbers[-1] > 0.5:
         return None
     terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
     sigma = min(float(terms @ np.array(_COEFFICIENTS)), _widest_at(numbers[2]), WIDEST_SIGMA)
-    if sigma < SMALLEST_SIGMA:
+    if sigma < 0.4:  # it costs little, and its estimate is wrong by 0.1 to 0.2 pixels
         return None
     box = _box(mask, REACH)
     rows, inside, kernel = rows[box], mask[box], inverse_filter(sigma)
@@ -85,7 +66,7 @@ def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float
         image = np.where(rows < 0, np.float32(0), observations[rows, light])
         observations[:n_pixels, light] = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)[inside]
 
-    with ThreadPoolExecutor(_THREADS, "sharpen") as pool:
+    with ThreadPoolExecutor(2, "sharpen") as pool:
         list(pool.map(sharpen, range(observations.shape[1])))
     np.maximum(observations[:n_pixels], 0, out=observations[:n_pixels])
     return sigma
@@ -108,7 +89,7 @@ def _widest_at(correlation: float) -> float:
     sigmas = np.linspace(0.05, 2, 200)
     one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)  # of the values, at one and two pixels
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
-    return float(np.interp(correlation + _CORRELATION_ERROR, of_gradients, sigmas))
+    return float(np.interp(correlation + 0.1, of_gradients, sigmas))
 
 
 def inverse_filter(sigma: float) -> Float32Array:
@@ -144,9 +125,9 @@ def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32
     so that highlights do not dominate.
     """
     n_pixels = np.count_nonzero(mask)
-    chosen = observations[:, :: -(-observations.shape[1] // _MOST_IMAGES)]
+    chosen = observations[:, :: -(-observations.shape[1] // 12)]  # of at most 12 images
     level = max(float(np.quantile(chosen[:n_pixels:7], 0.95)), 1e-12)
-    region = _grown(mask, _OUTLINE)
+    region = _grown(mask, 4)
     boxes = _looked_at(mask, region)
     parts, inside = np.stack([rows[box] for box in boxes]), np.stack([region[box] for box in boxes])
     images = np.moveaxis(
@@ -171,9 +152,9 @@ def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32
         two += _product(steps[..., 2:], steps[..., :-2])
         three += _product(steps[..., 3:], steps[..., :-3])
     edge, share = np.concatenate(edges), np.concatenate(shares)
-    if len(edge) < _FEWEST_EDGES:
+    if len(edge) < 60:
         return None
-    steepest = share[edge >= np.quantile(edge, 1 - _STEEP_SHARE)]
+    steepest = share[edge >= np.quantile(edge, 1 - 0.01)]
     between = across / (pairs - square) if pairs > square else 0.5
     return np.array([*np.quantile(steepest, (0.25, 0.75)), between, two / square, three / square])
 

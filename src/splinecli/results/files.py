@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import convert
 
-from splinecli import __version__
+from splinecli import __version__, output_files
 from splinecli.capture import Capture
 from splinecli.capture.light_files import rows_text
 from splinecli.capture.record import name_reading
@@ -26,17 +26,7 @@ from splinecli.documents import (
     WarningReport,
 )
 from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
-from splinecli.output_files import (
-    ERROR_MAP,
-    FOUND_DIRECTIONS,
-    FOUND_INTENSITIES,
-    FOUND_LIGHTS,
-    FOUND_MASK,
-    LIGHT_PLOT,
-    NORMALS,
-    REPORT,
-    own_files,
-)
+from splinecli.output_files import REPORT
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import error_map_picture
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, file_names
@@ -129,7 +119,7 @@ def write_estimate(
     caller has locked the folder. Writing is the clock's last stage. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
-    stale = [name for name in own_files() if name != FOUND_MASK] + own_light_files(folder)
+    stale = [name for name in output_files.own_files() if name != output_files.FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
             new.write(name, content)
@@ -148,7 +138,7 @@ def write_estimate(
 def own_light_files(folder: Path) -> list[str]:
     """Return the FOUND_LIGHTS in a folder of results that, according to its report, an earlier run wrote."""
     try:
-        return [name for name in FOUND_LIGHTS if name in read_report(folder)["files"]]
+        return [name for name in output_files.FOUND_LIGHTS if name in read_report(folder)["files"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
 
@@ -169,7 +159,8 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not (isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)):
         raise ValueError("the report has no list of files, or no sizes")
     # Users may edit the mask, and `integrate` may have replaced the surface.
-    changeable = (FOUND_MASK, *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()))
+    surface_files = file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()
+    changeable = (output_files.FOUND_MASK, *surface_files)
     for name in files:
         path = folder / name
         if name in changeable:
@@ -184,9 +175,9 @@ def read_report(folder: Path) -> dict[str, Any]:
 def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
     """Yield the normal map in the given formats, which are keys of NORMALS, and the error map if available."""
     for form in formats:
-        yield NORMALS[form], encode_normals(estimate, form, convention)
+        yield output_files.NORMALS[form], encode_normals(estimate, form, convention)
     if estimate.error_map_deg is not None:
-        yield ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg))
+        yield output_files.ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg))
 
 
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
@@ -213,7 +204,7 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
     """Yield the lights estimated from the images, in the format of `--lights` and `--intensities`, and their plot."""
-    yield FOUND_DIRECTIONS, rows_text(capture.light_directions)
+    yield output_files.FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if capture.estimated_intensities is not None:
-        yield FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
-    yield LIGHT_PLOT, plot
+        yield output_files.FOUND_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
+    yield output_files.LIGHT_PLOT, plot

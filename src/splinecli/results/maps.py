@@ -93,9 +93,6 @@ def relief(_: CaptureSource, estimate: NormalEstimate, __: Progress) -> NDArray[
     return relief_of_normals(estimate.normal_map, estimate.capture.mask)
 
 
-_TILE_PIXELS = 65_536
-
-
 def albedo_map(
     source: CaptureSource,
     capture: Capture,
@@ -114,8 +111,8 @@ def albedo_map(
     """
     normals = take_pixels(normal_map, capture.mask)
     counts = np.empty(capture.observations.shape, np.bool_)
-    for start in range(0, len(normals), _TILE_PIXELS):
-        tile = slice(start, start + _TILE_PIXELS)
+    for start in range(0, len(normals), 65_536):
+        tile = slice(start, start + 65_536)
         cosines, attenuation = _shading(capture, normals, tile, range(capture.n_lights))
         counts[tile] = _agreeing(capture.observations[tile] / attenuation, cosines)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)

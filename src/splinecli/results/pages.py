@@ -45,10 +45,7 @@ def render(template: str, **values: object) -> str:
 
 LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
 LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side length
-QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page initially shows maps with the second
-
 LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
-
 _LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # represents a component of 1
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
@@ -86,13 +83,16 @@ def result_page(
         reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(*shown.shape, *whole.shape[2:])
         maps[name] = map_picture(MAPS[name], reduced, shown)
     if error_map_deg is not None:
-        errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
-        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan)))
-    first = _first_pictures(maps, normals, shown) if shown.size > QUICK_MAP else {}
+        values_deg, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
+        error_png = _data_url(colour_errors(np.where(known, values_deg[..., 0], np.nan)))
+    first = _first_pictures(maps, normals, shown) if shown.size > 500_000 else {}
     (height, width), size = shown.shape, _size(shown)
     is_reduced = shown.shape != mask.shape
     stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None])[0]
-    figures = report["angular_error_deg"]
+    errors = report["angular_error_deg"] or {}
+    words = {"mean": "Mean", "median": "Median", "p90": "90th percentile"}
+    figures = [(word, f"{errors[name]:.2f}°") for name, word in words.items() if errors]
+    figures += [(f"Under {limit}°", f"{errors[f'under_{limit}']:.1%}") for limit in (5, 10) if errors]
     millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
@@ -104,15 +104,7 @@ def result_page(
         else None,
         unit="pixels" if millimetres is None else "mm",
         units_per_pixel=mask.shape[1] / width * (millimetres or 1),
-        errors=[]
-        if figures is None
-        else [
-            ("Mean", f"{figures['mean']:.2f}°"),
-            ("Median", f"{figures['median']:.2f}°"),
-            ("90th percentile", f"{figures['p90']:.2f}°"),
-            ("Under 5°", f"{figures['under_5']:.1%}"),
-            ("Under 10°", f"{figures['under_10']:.1%}"),
-        ],
+        errors=figures,
         width=width,
         height=height,
         light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
@@ -142,10 +134,10 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
 def _first_pictures(
     maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
 ) -> dict[str, Picture]:
-    """Return low-resolution pictures of the maps, which a browser shows while it loads the others."""
+    """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads the others."""
     import cv2
 
-    small, known = _reduce(normals, mask, FIRST_MAP)
+    small, known = _reduce(normals, mask, 100_000)
     first = dict(zip(("high", "low"), split_normals(unit(small), known), strict=True))
     for name in maps.keys() - first.keys():
         reduced = cv2.resize(maps[name], known.shape[::-1], interpolation=cv2.INTER_AREA)
@@ -181,7 +173,7 @@ def _size(mask: NDArray[np.bool_]) -> str:
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
     """Return pairs of terms and values; `reduced` is the size of the page's maps if they were reduced."""
     weights, expected = report["weights"], report["expected_under_5"]
-    seconds = report["seconds"].items()  # of the stages up to this page
+    stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]  # up to this page
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
     return [
         ("Method", report["method"]),
@@ -191,10 +183,7 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
         ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
         *([] if reduced is None else [("Size on this page", reduced)]),
-        (
-            "Seconds",
-            ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in seconds if n >= 0.05 and name != "total"),
-        ),
+        ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in stages)),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
 
@@ -204,9 +193,6 @@ def _data_url(picture: Picture) -> str:
 
 
 INDEX = "index.html"
-
-THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
-_OURS = b'<meta name="generator" content="splinecli">'
 
 
 class Row(NamedTuple):
@@ -271,7 +257,10 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None if it cannot be read."""
+    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if it cannot be read.
+
+    This is twice its size on the page, for sharp screens.
+    """
     import cv2
 
     try:
@@ -284,7 +273,7 @@ def _thumbnail(path: Path) -> str | None:
     if picture.dtype.kind != "u":
         return None
     height, width = picture.shape[:2]
-    shrink = min(1, THUMBNAIL[0] / width, THUMBNAIL[1] / height)
+    shrink = min(1, 256 / width, 192 / height)
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) / np.iinfo(picture.dtype).max
     done, jpeg = cv2.imencode(".jpg", np.rint(255 * small[..., ::-1]).astype(np.uint8))
@@ -315,7 +304,7 @@ def has_index(folder: Path) -> bool:
         if not (folder / INDEX).is_file():
             return False
         with (folder / INDEX).open("rb") as file:
-            return _OURS in file.read(1 << 16)  # the mark is near the top
+            return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)  # it is near the top
     except OSError:
         return False
 

@@ -69,11 +69,12 @@ class BilateralEquations:
         usable = cosine > SMALLEST_COSINE
         number = np.full(mask.shape, -1, np.int32)
         number[mask] = np.arange(len(normals))
-        return cls(
-            facing * usable,
-            (normals @ to_right * usable, normals @ down * usable),
-            (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
-        )
+        pairs = []
+        for near, far in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
+            both = (near >= 0) & (far >= 0)
+            pairs.append((near[both], far[both]))
+        slants = (normals @ to_right * usable, normals @ down * usable)
+        return cls(facing * usable, slants, (pairs[0], pairs[1]))
 
     def weigh(self, heights: Float64Array, discontinuity: float) -> tuple[Float64Array, Float64Array]:
         """Return the weights of all pairs at the heights (P,), and their flows.
@@ -104,23 +105,11 @@ class BilateralEquations:
         return np.concatenate(weights), np.concatenate(flows)
 
 
-def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
-    both = (near >= 0) & (far >= 0)
-    return near[both], far[both]
-
-
-# Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that no
-# equation ties to others keep their heights, and the system is never singular.
-_DAMPING_OF_GAPS = 1e-7
-
-
 class LaplacianSolver:
     """Solve the normal equations of pairs of neighbours again and again, with other weights each time.
 
     The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients with an algebraic
-    multigrid preconditioner.
-
-    The setup of multigrid costs as much as several solves, so it is kept while the weights stay similar.
+    multigrid preconditioner. Its setup costs as much as several solves, so it is kept while the weights stay similar.
     """
 
     def __init__(self, pairs: tuple[tuple[Pixels, Pixels], ...], n_pixels: int) -> None:
@@ -153,9 +142,15 @@ class LaplacianSolver:
         `distance` (P,) has the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
+        from scipy.sparse import csr_matrix
         from scipy.sparse.linalg import cg
 
-        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
+        # Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that
+        # no equation ties to others keep their heights, and the system is never singular.
+        weights = weights + 1e-7
+        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
+        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
+        matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
@@ -172,13 +167,6 @@ class LaplacianSolver:
         if next(steps) > 15:  # above this number of steps, a new preconditioner saves more time than it costs
             self._preconditioner = None
         return change
-
-    def _laplacian(self, weights: Float64Array, pull: Float64Array | float) -> Any:
-        from scipy.sparse import csr_matrix
-
-        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
-        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
-        return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 
     def _sum(self, of_pairs: Float64Array, pixels: Pixels) -> Float64Array:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

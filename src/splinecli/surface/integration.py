@@ -21,17 +21,12 @@ from splinecli.maths.normals import unit
 from splinecli.surface.bilateral_equations import DISCONTINUITY, SMALLEST_COSINE, BilateralEquations, LaplacianSolver
 from splinecli.surface.pixel_grid import Blocks, focal_length
 
-_UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and refuses zero vectors
-_FIRST_PRECISION, _LATER_PRECISION = 1e-9, 0.03  # relative residuals of the linear solves
+_LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
 _STILL = 0.002  # pixels: the rms movement at which the surface is finished
 _COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 _SOLVES_OF_COARSEST = 150
-_SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
 _LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
-_FARTHEST = 3.0  # from the median height to any other, in the larger of the mask's width and height
-
-RELIEF_WIDTH = 64.0
-"""The high-pass filter halves the amplitude at this wavelength in pixels; it suppresses errors at longer ones."""
+RELIEF_WIDTH = 64.0  # pixels: the wavelength at which the high-pass filter halves the amplitude
 
 Progress = Callable[[float], object]  # called with the share of the work that was just done
 
@@ -72,12 +67,15 @@ def integrate_normals(
     if not (isfinite(discontinuity) and discontinuity >= 0):
         raise UsageError(f"the discontinuity is {discontinuity:g}, expected a number of at least 0")
     if mask is None:
-        mask = _mask_of_normals(normal_map)
+        if normal_map.ndim != 3 or normal_map.shape[2] != 3:
+            raise UsageError(f"the normal map has shape {normal_map.shape}, expected (H, W, 3)")
+        mask = np.asarray(np.isfinite(normal_map).all(axis=2) & normal_map.any(axis=2))
+        if not mask.any():
+            raise InputError("the normal map has no normal: all vectors are zero or not finite")
     _check_maps(normal_map, mask)
     known = None
     if prior is not None:
         known = _heights_of_prior(prior, mask, camera_matrix)
-        # By default, 0.15 times the root of the mask's area
         prior_detail = 0.15 * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
         if not (isfinite(prior_detail) and prior_detail > 0):
             raise UsageError(f"the detail of the prior is {prior_detail:g} pixels, expected a positive number")
@@ -95,9 +93,8 @@ def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
-    return integrate_normals(normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(
-        np.float32
-    )
+    relief = integrate_normals(normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH)
+    return relief.astype(np.float32)
 
 
 class _Surface(NamedTuple):
@@ -135,7 +132,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
     heights: Float64Array = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
-    precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
+    precision, most, own_share = 1e-9, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
     is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
     if is_huge or (n_pixels > _COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
@@ -145,7 +142,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights
-        precision, most = _LATER_PRECISION, min(20, max(4, _SOLVED_PIXELS // n_pixels))
+        precision, most = _LATER_PRECISION, min(20, max(4, 1_000_000 // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
     # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the same weight.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
@@ -224,23 +221,13 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        raise InputError(
-            f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
-            hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",
-        )
+        problem = f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1"
+        hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the result"
+        raise InputError(problem, hint=hint)
     assert surface.prior is not None
-    farthest = _FARTHEST * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
+    farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
     away = np.abs(surface.prior - np.nanmedian(surface.prior)) > farthest
-    _refuse(away, surface.mask, f"farther from their median than {_FARTHEST:g} times the width of the object")
-
-
-def _mask_of_normals(normal_map: Floats) -> Bools:
-    if normal_map.ndim != 3 or normal_map.shape[2] != 3:
-        raise UsageError(f"the normal map has shape {normal_map.shape}, expected (H, W, 3)")
-    mask = np.asarray(np.isfinite(normal_map).all(axis=2) & normal_map.any(axis=2))
-    if not mask.any():
-        raise InputError("the normal map has no normal: all vectors are zero or not finite")
-    return mask
+    _refuse(away, surface.mask, "farther from their median than 3 times the width of the object")
 
 
 def _depth_map(
@@ -268,11 +255,10 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     wrong = mask.copy()
     length = np.linalg.norm(normal_map[mask].astype(np.float64), axis=1)
-    wrong[mask] = ~(np.abs(length - 1) <= _UNIT_TOLERANCE)  # also True for NaN
+    # The tolerance accepts normals from float16 and 8-bit images, and refuses zero vectors. NaN is wrong, too.
+    wrong[mask] = ~(np.abs(length - 1) <= 1e-2)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
-        raise InputError(
-            f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors, the first in row "
-            f"{row}, column {column}",
-            hint="Leave pixels without a normal out of the mask",
-        )
+        problem = f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors, the first in"
+        hint = "Leave pixels without a normal out of the mask"
+        raise InputError(f"{problem} row {row}, column {column}", hint=hint)

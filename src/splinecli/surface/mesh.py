@@ -160,22 +160,15 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     whole = squares[inside.all(axis=1)]
     step = np.abs(heights[whole[:, :2]] - heights[whole[:, 2:]])
     across = step[:, 0] <= step[:, 1]
-    parts = [
-        whole[across][:, [0, 1, 2]],
-        whole[across][:, [0, 2, 3]],
-        whole[~across][:, [0, 1, 3]],
-        whole[~across][:, [1, 2, 3]],
-    ]
+    corners = {True: ([0, 1, 2], [0, 2, 3]), False: ([0, 1, 3], [1, 2, 3])}
+    parts = [whole[across == way][:, three] for way, halves in corners.items() for three in halves]
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
 
 
-TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
 LARGE_MAP = 500_000  # pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
-_TRIANGLES = 50_000  # at a time
 _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
-_LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 
 
 def decimated_mesh(
@@ -241,9 +234,9 @@ def _mesh_of_blocks(
     """Return a mesh of blocks of a large map's pixels; None if they would be too few, or the map is small.
 
     Collapsing all edges of a large map takes much memory. If far fewer triangles are requested, a mesh of the blocks,
-    with at least TRIANGLES_LEFT times as many, has the same shape, and the normal texture keeps the detail.
+    with at least four times as many, has the same shape, and the normal texture keeps the detail.
     """
-    step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
+    step = int((2 * np.count_nonzero(mask) / (4 * n_triangles)) ** 0.5)
     if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
         return None
     blocks = Blocks.of_step(mask, step)
@@ -310,7 +303,7 @@ def _in_frame(measured: Float64Array, normals: Float64Array, tangents: Float64Ar
     skew = np.einsum("qx,qx->q", tangents, normals)
     square = np.maximum(1 - skew**2, 1e-6)
     texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
-    texels[:, 2] = np.maximum(texels[:, 2], _LOWEST)
+    texels[:, 2] = np.maximum(texels[:, 2], 1 / 255)  # glTF allows no normal below the surface
     return unit(texels)
 
 
@@ -318,8 +311,8 @@ def _covered_pixels(
     points: Float64Array, triangles: Integers, shape: tuple[int, ...]
 ) -> Iterator[tuple[NDArray[np.intp], Float64Array, NDArray[np.intp], NDArray[np.intp]]]:
     """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
-    for start in range(0, len(triangles), _TRIANGLES):
-        numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
+    for start in range(0, len(triangles), 50_000):
+        numbers = np.arange(start, min(start + 50_000, len(triangles)))
         corners = points[triangles[numbers]]
         forms = _barycentric_forms(corners)
         seen = np.isfinite(forms).all(axis=(1, 2))

@@ -37,11 +37,8 @@ SURFACE_FILES = {
 
 LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = "level_normals.npy", "level_normals.png"  # of `integrate --level`
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
-DEFAULT_MESHES = ("glb", "ply")
-DEPTH_FORMATS = ("npy", "tiff", "png")
-DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
+DEFAULT_FORMATS = ("glb", "ply", "npy", "tiff", "png")
 GRAY = 204  # colour of a mesh without a texture, of 255
-_WHITE = 65535  # of 16 bits
 
 
 @dataclass(frozen=True)
@@ -75,12 +72,25 @@ def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -
 def _encode_glb(surface: Surface) -> bytes:
     """Encode binary glTF 2.0, in metres: a matte material with the textures, lit from both sides."""
     import trimesh
+    from PIL import Image
 
     from splinecli.surface.mesh import no_triangles
 
     mesh = surface.mesh
     if not len(mesh.triangles):
         raise no_triangles()
+
+    def add_tangents(buffers: Any, tree: Any) -> None:
+        """Add the tangents to a glTF file. Without them, viewers derive their own tangents in different ways."""
+        if mesh.tangents is None:
+            return
+        for part in (part for shape in tree["meshes"] for part in shape["primitives"]):
+            part["attributes"]["TANGENT"] = len(tree["accessors"])
+        accessor = {"bufferView": len(buffers), "componentType": 5126, "type": "VEC4", "count": len(mesh.tangents)}
+        tree["accessors"]["tangents"] = accessor
+        # The last number is the sign of the bitangent.
+        buffers["tangents"] = np.insert(mesh.tangents, 3, 1, axis=1).astype("<f4").tobytes()
+
     textures = {"baseColorTexture": mesh.texture, "normalTexture": mesh.normal_texture}
     material = trimesh.visual.material.PBRMaterial(
         name="surface",
@@ -88,11 +98,11 @@ def _encode_glb(surface: Surface) -> bytes:
         roughnessFactor=1.0,
         doubleSided=True,
         baseColorFactor=[GRAY] * 3 + [255] if mesh.texture is None else None,
-        **{name: _image(picture) for name, picture in textures.items() if picture is not None},
+        **{name: Image.fromarray(picture) for name, picture in textures.items() if picture is not None},
     )
     shown = _trimesh(mesh, _textured(mesh, material), surface.millimetres / 1000)
     glb: bytes = trimesh.exchange.gltf.export_glb(
-        shown.scene(), include_normals=True, buffer_postprocessor=_tangent_writer(mesh)
+        shown.scene(), include_normals=True, buffer_postprocessor=add_tangents
     )
     return glb
 
@@ -110,9 +120,10 @@ def _encode_ply(surface: Surface) -> bytes:
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
     """Encode OBJ with normals, texture coordinates and, with colours, a texture. A comment has the unit's name."""
     import trimesh
+    from PIL import Image
 
     mesh = surface.mesh
-    image = None if mesh.texture is None else _image(mesh.texture)
+    image = None if mesh.texture is None else Image.fromarray(mesh.texture)
     diffuse = (GRAY if image is None else 255,) * 3
     material = trimesh.visual.material.SimpleMaterial(image, diffuse, specular=(0, 0, 0), name="mesh")
     text, files = trimesh.exchange.obj.export_obj(
@@ -151,8 +162,8 @@ def _encode_png(surface: Surface) -> bytes:
     low, high = float(np.nanmin(surface.depth)), float(np.nanmax(surface.depth))
     share = (surface.depth - low) / max(high - low, np.finfo(np.float64).tiny)
     file, text = io.BytesIO(), PngImagePlugin.PngInfo()
-    text.add_text("depth", f"0 outside, 1 = {low:.7g}, {_WHITE} = {high:.7g}; unit: {surface.unit}")
-    gray = np.where(np.isfinite(share), np.rint(1 + np.nan_to_num(share) * (_WHITE - 1)), 0)
+    text.add_text("depth", f"0 outside, 1 = {low:.7g}, 65535 = {high:.7g}; unit: {surface.unit}")
+    gray = np.where(np.isfinite(share), np.rint(1 + np.nan_to_num(share) * 65534), 0)
     Image.fromarray(gray.astype(np.uint16)).save(file, "PNG", pnginfo=text)
     return file.getvalue()
 
@@ -181,36 +192,6 @@ def _textured(mesh: SurfaceMesh, material: Any) -> Any:
 
     # v runs up in trimesh and OBJ.
     return trimesh.visual.TextureVisuals(mesh.uvs * (1, -1) + (0, 1), material)
-
-
-def _image(picture: NDArray[np.uint8]) -> Any:
-    from PIL import Image
-
-    return Image.fromarray(picture)
-
-
-def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
-    """Return the function that adds the tangents to the buffers and the tree of a glTF file, or None without any.
-
-    Without them, viewers derive their own tangents in different ways.
-    """
-    tangents = mesh.tangents
-    if tangents is None:
-        return None
-
-    def add(buffers: Any, tree: Any) -> None:
-        for part in (part for shape in tree["meshes"] for part in shape["primitives"]):
-            part["attributes"]["TANGENT"] = len(tree["accessors"])
-        tree["accessors"]["tangents"] = {
-            "bufferView": len(buffers),
-            "componentType": 5126,  # of glTF
-            "type": "VEC4",
-            "count": len(tangents),
-        }
-        # The last number is the sign of the bitangent.
-        buffers["tangents"] = np.insert(tangents, 3, 1, axis=1).astype("<f4").tobytes()
-
-    return add
 
 
 def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:

@@ -1,9 +1,7 @@
-"""Batches of training pixels from any source: simulated observations and ground truth.
+"""Batches of training pixels, and the faults of a capture: exposure, noise, quantisation and errors of calibration.
 
-Faults of a capture: exposure, noise, quantisation, and errors of calibration, as random draws for each pixel.
-
-They change only the sparse observations; the dense map stays the ground truth. Each function documents the distribution
-it draws from. Observations are linear, and 1 is the sensor's full scale.
+Faults are random draws for each pixel from the distributions in the docstrings. They change only the sparse
+observations; the dense map stays the ground truth. Observations are linear, and 1 is the sensor's full scale.
 """
 
 import math
@@ -18,12 +16,7 @@ from torch import Tensor
 from splinecli.maths.transfer import decode_transfer
 from splinecli.records import Count, Share
 from splinecli.restoration.images import restore_saturated
-from splinecli.synthesis.random_numbers import draw_uniform
-
-DARK_SHARE = 0.4
-"""Share of the pixels that are dark compared with the brightest in their capture, which determines the exposure."""
-
-BITS = (10, 12, 14, 16)  # bit depths of the pixels that do not have 8 bits, equally likely
+from splinecli.synthesis import draw_uniform
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -62,11 +55,11 @@ def draw_light_intensities(pixels: int, lights: int, share: float, generator: to
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
     """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
 
-    The brightest observation of a pixel is 10^U(-2.7, -0.7) for DARK_SHARE of the pixels, else 10^U(-1.3, 0). For
-    `saturated_share` of the pixels it is U(1, 3), and is clipped later.
+    The brightest observation of a pixel is 10^U(-2.7, -0.7) for 40 % of the pixels, which are dark compared with the
+    brightest in their capture, else 10^U(-1.3, 0). For `saturated_share` of the pixels it is U(1, 3), to be clipped.
     """
     pixels = len(radiance)
-    dark = draw_uniform(generator, pixels, 1) < DARK_SHARE
+    dark = draw_uniform(generator, pixels, 1) < 0.4
     level = draw_uniform(generator, pixels, 1)
     level = 10 ** torch.where(dark, 2.0 * level - 2.7, 1.3 * level - 1.3)
     over = draw_uniform(generator, pixels, 1, low=1.0, high=3.0)
@@ -89,7 +82,7 @@ def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
-    """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to one of BITS.
+    """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to 10, 12, 14 or 16.
 
     Half of the 8-bit pixels are encoded with the sRGB curve, rounded and decoded again. Of the others, half are rounded
     and half truncated, as when only the high byte of 16 bits is kept.
@@ -97,9 +90,7 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     pixels = len(exposed)
     eight = draw_uniform(generator, pixels, 1) < eight_bit_share
     kind = draw_uniform(generator, pixels, 1)
-    depth = torch.tensor(BITS, device=exposed.device)[
-        torch.randint(len(BITS), (pixels, 1), generator=generator, device=exposed.device)
-    ]
+    depth = 10 + 2 * torch.randint(4, (pixels, 1), generator=generator, device=exposed.device)
     steps = torch.where(eight, 255.0, 2.0**depth - 1).to(exposed.dtype)
     rounded = (exposed * steps).round() / steps
     cut = (exposed * 256).floor().clamp(max=255) / 255
@@ -131,10 +122,7 @@ LightCount = Annotated[int, Meta(ge=3)]
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How pixels are photographed, and how often each fault occurs, as a share of the pixels.
-
-    A share of 0 disables a fault.
-    """
+    """How pixels are photographed, and how often each fault occurs, as a share of the pixels; 0 disables a fault."""
 
     # min_lights, max_lights, usual_lights: see draw_light_counts
     min_lights: LightCount = 4
@@ -165,17 +153,15 @@ class DenseMap(NamedTuple):
 
 
 class PixelTruth(Protocol):
-    """The true normals and dense maps of P pixels."""
+    """The true unit normals (P, 3) and the dense maps of P pixels, at the scale of the radiance.
+
+    `rotate` turns each pixel about the view axis by its own angle, given as cosine and sine (P,).
+    """
 
     @property
-    def normals(self) -> Tensor:
-        """Unit normals (P, 3)."""
-
-    def rotate(self, cosine: Tensor, sine: Tensor) -> Self:
-        """Rotate each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
-
-    def dense_truth(self, size: int) -> DenseMap:
-        """Return the complete maps at the scale of the radiance."""
+    def normals(self) -> Tensor: ...
+    def rotate(self, cosine: Tensor, sine: Tensor) -> Self: ...
+    def dense_truth(self, size: int) -> DenseMap: ...
 
 
 @dataclass(frozen=True)
@@ -198,10 +184,7 @@ def photograph(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with its own random faults.
-
-    These are camera and calibration faults.
-    """
+    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with its own camera and calibration faults."""
     pixels, lights = radiance.shape
     intensities = draw_light_intensities(pixels, lights, config.unequal_lights_share, generator)
     radiance = radiance * valid

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.synthesis import draw_number
 from splinecli.synthesis.principled import draw_material, with_one_gloss
-from splinecli.synthesis.random_numbers import draw_number
 
 
 def draw_engraved(

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.random_numbers import draw_uniform
+from splinecli.synthesis import draw_uniform
 
 
 def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:

@@ -87,10 +87,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def _read_known(path: Path) -> tuple[str, bytes]:
-    """Return the format of a mesh file, detected from its content, and that content.
-
-    Raises InputError if the format is not supported or the file too large, or OSError if it cannot be read.
-    """
+    """Return the format of a mesh file, detected from its content, and that content."""
     with path.open("rb") as file:
         content = file.read(max(_LONGEST.values()) + 1)
     triangles = int.from_bytes(content[80:84], "little")
@@ -101,7 +98,7 @@ def _read_known(path: Path) -> tuple[str, bytes]:
     elif b"\0" not in content and re.search(rb"^[ \t]*v\s", content, re.MULTILINE):
         kind = "obj"
     else:
-        raise ValueError("it has none of these formats")
+        raise ValueError("it is in none of these formats")
     if len(content) > (most := _LONGEST[kind]):
         raise InputError(f"found a longer file than {most / 1e6:.0f} MB", path=path, hint="Decimate the mesh")
     return kind, content
@@ -240,6 +237,8 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
 
     Only the largest connected part is kept.
     """
+    from trimesh.graph import connected_component_labels
+
     counts = [int(np.ceil(2 * half / spacing / COARSE)) * COARSE + 1 for half in half_widths]
     axes = [((np.arange(count) - (count - 1) / 2) * spacing).astype(np.float32) for count in counts]
     values = _sample(field, axes, spacing)
@@ -249,7 +248,9 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     # The corners of a face run anticlockwise as seen from the side with values above 0, which is outside.
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
-    vertices, faces = _largest_part(vertices, faces)
+    part = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices))
+    kept = part == np.bincount(part).argmax()
+    vertices, faces = vertices[kept], (np.cumsum(kept) - 1)[faces[kept[faces[:, 0]]]].astype(np.int32)
     # Take one Newton step, because linear interpolation between samples leaves terraces.
     slope = gradient(field, vertices)
     squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
@@ -290,12 +291,3 @@ def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     # Evaluate in pieces that fit into the processor's cache.
     pieces = [field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
-
-
-def _largest_part(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, NDArray[np.int32]]:
-    from trimesh.graph import connected_component_labels
-
-    part = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices))
-    kept = part == np.bincount(part).argmax()
-    row = np.cumsum(kept) - 1
-    return vertices[kept], row[faces[kept[faces[:, 0]]]].astype(np.int32)

@@ -17,10 +17,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from splinecli.maths.transfer import decode_transfer, encode_srgb
-from splinecli.synthesis.random_numbers import draw_number
-
-_FINER = 5  # samples of a blur's kernel per pixel and axis
-_DEPTH = 65535  # OpenCV interpolates Bayer patterns of 16-bit integers
+from splinecli.synthesis import draw_number
 
 
 @dataclass(frozen=True)
@@ -41,7 +38,12 @@ class Optics:
     def develop(self, colours: Tensor) -> Tensor:
         """Return the gray images (F, H, W), 0 to 1, from the noisy sensor exposure (3, F, H, W), 0 to 1."""
         if self.demosaic is not None:
-            colours = _interpolated(colours, self.demosaic)
+            pattern = colours[1].clone()  # red, green / green, blue
+            pattern[:, ::2, ::2] = colours[0, :, ::2, ::2]
+            pattern[:, 1::2, 1::2] = colours[2, :, 1::2, 1::2]
+            stored = (pattern.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)  # OpenCV interpolates integers
+            found = np.stack([cv2.cvtColor(image, self.demosaic) for image in stored])
+            colours = torch.from_numpy(found.astype(np.float32) / 65535).permute(3, 0, 1, 2)
         gray = torch.einsum("c,cfhw->fhw", torch.tensor(self.weights), colours)
         if self.sharpening:
             soft = _blurred(gray, gaussian_kernel(self.sharpening_sigma))
@@ -97,11 +99,11 @@ def gaussian_kernel(sigma: float) -> Tensor:
 
 def disc_kernel(sigma: float) -> Tensor:
     """Return a disc (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either axis."""
-    radius = 2 * sigma
+    radius, finer = 2 * sigma, 5  # samples per pixel and axis
     reach = math.ceil(radius)
-    places = (torch.arange((2 * reach + 1) * _FINER) + 0.5) / _FINER - 0.5 - reach
+    places = (torch.arange((2 * reach + 1) * finer) + 0.5) / finer - 0.5 - reach
     inside = (places[:, None] ** 2 + places**2 <= max(radius, 0.2) ** 2).float()
-    kernel = torch.nn.functional.avg_pool2d(inside[None, None], _FINER)[0, 0]
+    kernel = torch.nn.functional.avg_pool2d(inside[None, None], finer)[0, 0]
     return kernel / kernel.sum()
 
 
@@ -124,13 +126,3 @@ def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
     reach = len(kernel) // 2
     around = pad(images[:, None], (reach,) * 4, mode="replicate")
     return conv2d(around, kernel[None, None].to(images))[:, 0]
-
-
-def _interpolated(colours: Tensor, code: int) -> Tensor:
-    """Return colours (3, F, H, W), 0 to 1, as interpolated from a Bayer pattern of red, green / green, blue."""
-    pattern = colours[1].clone()
-    pattern[:, ::2, ::2] = colours[0, :, ::2, ::2]
-    pattern[:, 1::2, 1::2] = colours[2, :, 1::2, 1::2]
-    stored = (pattern.clamp(0, 1) * _DEPTH).round().numpy().astype(np.uint16)
-    found = np.stack([cv2.cvtColor(image, code) for image in stored])
-    return torch.from_numpy(found.astype(np.float32) / _DEPTH).permute(3, 0, 1, 2)

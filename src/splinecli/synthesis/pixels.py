@@ -16,10 +16,10 @@ from torch import Tensor
 
 from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.records import Share
+from splinecli.synthesis import draw_uniform
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.synthesis.principled import PrincipledMaterial, choose, draw_material
-from splinecli.synthesis.random_numbers import draw_uniform
 from splinecli.synthesis.whole_capture import photograph_captures
 
 
@@ -199,13 +199,6 @@ def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
     return torch.stack((radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1)
 
 
-def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw normals across an edge: add a Gaussian of sigma 0.5 to each and keep it towards the camera."""
-    moved = normals + 0.5 * torch.randn(normals.shape, generator=generator, device=normals.device)
-    moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
-    return torch.nn.functional.normalize(moved, dim=1)
-
-
 def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
     """Draw random pixels. Half of the mixed pixels are on an edge, with a second normal; half blend two materials.
 
@@ -238,13 +231,13 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     # Every second mixed pixel is an edge, with one material on two normals. The others have two materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     second = choose(edge, material.take(slice(count)), draw_material(count, generator))
-    second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])
+    # Across an edge, a Gaussian of sigma 0.5 is added to the normal, which stays towards the camera.
+    moved = normals[:count] + 0.5 * torch.randn((count, 3), generator=generator, device=normals.device)
+    moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
+    second_normals = torch.where(edge, torch.nn.functional.normalize(moved, dim=1), normals[:count])
     mixed = PixelScene(second_normals, second, (), ambient[:count])
     weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
     return PixelScene(normals, material, walls, ambient, mixed, weight)
-
-
-_MOST_MATERIALS = 8
 
 
 def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator) -> PrincipledMaterial:
@@ -253,11 +246,11 @@ def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator
     60 % of the captures have one material, the others 2 to 8. In half of the captures, the materials differ only in
     their base colour, as on a painted or printed object of uniform gloss.
     """
-    drawn = draw_material(captures * _MOST_MATERIALS, generator)
-    count = 2 + ((_MOST_MATERIALS - 1) * draw_uniform(generator, captures)).long()
+    drawn = draw_material(captures * 8, generator)
+    count = 2 + (7 * draw_uniform(generator, captures)).long()
     count[draw_uniform(generator, captures) < 0.6] = 1
     size = pixels // captures
-    first = _MOST_MATERIALS * torch.arange(captures, device=count.device).repeat(size)
+    first = 8 * torch.arange(captures, device=count.device).repeat(size)
     chosen = first + (count.repeat(size) * draw_uniform(generator, pixels)).long()
     one_gloss = (draw_uniform(generator, captures, 1) < 0.5).repeat(size, 1)
     material = drawn.take(chosen)

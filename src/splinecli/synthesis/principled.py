@@ -15,13 +15,12 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.random_numbers import draw_uniform
+from splinecli.synthesis import draw_uniform
 
+# Thresholds on the uniform number that selects the kind of material: matte below the first, then as named; and the
+# material classes of the rendered scenes as ranges of that number.
 _SHINY, _METAL, _HALF_METAL = 0.30, 0.58, 0.86
-"""Thresholds on the uniform number that selects the kind of material: matte below the first, then as named."""
-
 CLASSES = {"diffuse": (0.0, _SHINY), "specular": (_SHINY, _METAL), "metallic": (_METAL, 1.0)}
-"""Material classes of the rendered scenes, and the range of the number that selects the kind."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,7 @@ class PrincipledMaterial:
         if bool((self.minnaert != 1).any()):
             diffuse = diffuse * _power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
         if bool((self.retro > 0).any()):
-            # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees
-            # apart.
+            # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart.
             diffuse = diffuse + self.retro * l_dot_h ** (2 * 20)
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
@@ -126,10 +124,8 @@ def draw_material(
     retro: 10^U(-1.3, 0) on 8 % of the non-metals.
 
     The measured MERL materials fall off faster than the cosine: the median exponent of n.l over the non-metals is 1.14,
-    and nine tenths are between 0.86 and 1.47. The ranges of base and minnaert were chosen to approximate this.
-
-    Args:
-        kinds: the range of the uniform number that selects the kind.
+    and nine tenths are between 0.86 and 1.47. The ranges of base and minnaert were chosen to approximate this. `kinds`
+    is the range of the uniform number that selects the kind.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
@@ -173,7 +169,10 @@ def _facets(n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Te
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
     if bool((tail_exponent < 2).any()):
-        lobe = _tail_norm(alpha_squared, tail_exponent) * _power(spread, -tail_exponent)
+        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at gamma = 2
+        narrow = alpha_squared.clamp(max=0.999)
+        norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
+        lobe = norm * _power(spread, -tail_exponent)
     else:
         lobe = alpha_squared / (spread * spread)
     return lobe * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared)
@@ -189,12 +188,6 @@ def schlick_weight(cosine: Tensor) -> Tensor:
 def _power(base: Tensor, exponent: Tensor) -> Tensor:
     """Return base^exponent for base > 0, faster than torch.pow and accurate enough for images."""
     return (base.log() * exponent).exp()
-
-
-def _tail_norm(alpha_squared: Tensor, gamma: Tensor) -> Tensor:
-    """Return pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at gamma = 2."""
-    alpha_squared = alpha_squared.clamp(max=0.999)
-    return (gamma - 1) * (1 - alpha_squared) / (alpha_squared ** (1 - gamma) - 1)
 
 
 def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:

@@ -17,10 +17,9 @@ from splinecli.maths.normals import unit
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.system.machine import import_extra
 
+# Distance from the surface at which rays start. The frame has half-width 1, so float32 rounding displaces hits by about
+# 1e-7; at 128 pixels, one pixel is 0.016 wide.
 OFFSET = 1e-4
-"""Distance from the surface at which rays start. The frame has half-width 1, so float32 rounding displaces hits by
-about 1e-7; at 128 pixels, one pixel is 0.016 wide."""
-
 TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
 
@@ -99,28 +98,17 @@ class ShadowCache:
         self._known = np.zeros(vertices, dtype=bool)
 
     def lit(self, hits: Hits) -> NDArray[np.bool_]:
-        """Return which lights reach the vertices nearest to the surface points, (N, F) bool."""
-        nearest = self._nearest(hits)
-        self._trace(nearest)
-        return self._free[nearest]
-
-    def prepare(self, hits: Hits) -> None:
-        """Trace the shadows at surface points in advance: many together are faster than few at a time."""
-        self._trace(self._nearest(hits))
-
-    def _nearest(self, hits: Hits) -> NDArray[np.int64]:
-        faces = self._tracer.mesh.faces
-        return np.asarray(faces[hits.triangle, hits.weights.argmax(axis=1)], dtype=np.int64)
-
-    def _trace(self, vertices: NDArray[np.int64]) -> None:
-        new = np.unique(vertices[~self._known[vertices]])
+        """Return which lights reach the vertices nearest to the surface points, (N, F). Many at a time are faster."""
         mesh = self._tracer.mesh
+        nearest = np.asarray(mesh.faces[hits.triangle, hits.weights.argmax(axis=1)], dtype=np.int64)
+        new = np.unique(nearest[~self._known[nearest]])
         for start in range(0, len(new), TRACED_ROWS):
             some = new[start : start + TRACED_ROWS]
             normals = mesh.vertex_normals[some]
             origins = mesh.vertices[some] + np.float32(OFFSET) * normals
             self._free[some] = self._tracer.lit(origins, normals @ self._lights.T > 0, self._lights)
         self._known[new] = True
+        return self._free[nearest]
 
 
 def _packed(vectors: Floats) -> Floats:
@@ -149,11 +137,8 @@ def find_visible_surface(
     """Trace the camera's rays: size x size pixels of samples x samples samples each.
 
     A pixel is dropped if more than half of its samples miss the surface, or if the surface is at a grazing angle.
-    Samples that miss are replaced by other samples of the same pixel.
-
-    Args:
-        bend: function that returns new normals (N, 3) from the mesh normals and positions of the samples; None to keep
-            the mesh normals.
+    Samples that miss are replaced by other samples of the same pixel. `bend` gives new normals (N, 3) from the mesh
+    normals and the positions of the samples.
     """
     steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(2 / (size * samples)) - 1
     row, column = np.meshgrid(np.arange(size * samples), np.arange(size * samples), indexing="ij")

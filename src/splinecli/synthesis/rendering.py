@@ -8,7 +8,7 @@ lights illuminate each vertex of a path at once. Visibility does not depend on t
 traced once for all materials.
 
 Two approximations reduce noise, because caustics would otherwise appear as single bright pixels. First, surfaces
-that emit or receive indirect light have at least roughness SOFTEST (path space regularization, Kaplanyan & Dachsbacher
+that emit or receive indirect light have at least roughness 0.3 (path space regularization, Kaplanyan & Dachsbacher
 2013). Second, surface points beyond the first use the shadows of the nearest vertex.
 """
 
@@ -27,10 +27,7 @@ from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer, VisibleSurface
 
-SOFTEST = 0.3  # lowest roughness of surfaces that illuminate other surfaces
-
-SHADED_ROWS = 512
-"""Number of points shaded together. A tensor then takes about a megabyte and stays in the cache."""
+SHADED_ROWS = 512  # points shaded together: a tensor then takes about a megabyte and stays in the cache
 
 Materials = Mapping[str, PrincipledMaterial]
 Progress = Callable[[float], None]
@@ -75,9 +72,7 @@ def _covered(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, 
 
 @dataclass(frozen=True)
 class _Vertices:
-    """N vertices of paths."""
-
-    hits: Hits  # the surface points
+    hits: Hits  # the surface points of N vertices of paths
     back: Tensor  # (N, 3), unit directions to the previous vertex
     pixel: Tensor  # (N,), the pixel of the path
     patches: Tensor  # (N,), the patch of the surface
@@ -127,8 +122,12 @@ def render_indirect(
                 shift = torch.rand(len(vertices.pixel), 2, generator=generator)
             vertices, weights = _extend(tracer, vertices, weights, soft, patch_of_face, ordinal, shift)
             _gather(vertices, weights, soft, torch.from_numpy(lights), shadows, radiance)
-            vertices, weights = _thin_out(vertices, weights, 1 / directions, generator)
-            if not len(vertices.pixel):
+            # Russian roulette: a path survives with its remaining weight in the brightest material as probability.
+            chance = (torch.stack(list(weights.values())).amax(dim=0)[:, 0] / (1 / directions)).clamp(0.0, 1.0)
+            alive = (torch.rand(len(chance), generator=generator) < chance).nonzero()[:, 0]
+            vertices = vertices.take(alive)
+            weights = {name: weight[alive] / chance[alive, None] for name, weight in weights.items()}
+            if not len(alive):
                 break
         progress((int(rows[-1]) + 1) / pixels)
     return _covered(radiance, visible)
@@ -138,8 +137,8 @@ def soften(material: PrincipledMaterial) -> PrincipledMaterial:
     """Return the reflectance without its sharpest lobes, for surfaces that illuminate other surfaces."""
     return replace(
         material,
-        roughness=material.roughness.clamp(min=SOFTEST),
-        second_roughness=material.second_roughness.clamp(min=SOFTEST),
+        roughness=material.roughness.clamp(min=0.3),
+        second_roughness=material.second_roughness.clamp(min=0.3),
         clearcoat_gloss=torch.zeros_like(material.clearcoat_gloss),
     )
 
@@ -185,12 +184,11 @@ def _gather(
     radiance: dict[str, Tensor],
 ) -> None:
     """Add the light that the vertices reflect to the radiance of their pixels."""
-    shadows.prepare(vertices.hits)
+    lit = torch.from_numpy(shadows.lit(vertices.hits))
     for start in range(0, len(vertices.pixel), SHADED_ROWS):
         some = slice(start, start + SHADED_ROWS)
-        hits = vertices.hits.take(np.arange(start, min(start + SHADED_ROWS, len(vertices.pixel))))
-        normals, back = torch.from_numpy(hits.normal), vertices.back[some]
-        cosines = (normals @ lights.T).clamp(min=0) * torch.from_numpy(shadows.lit(hits))
+        normals, back = torch.from_numpy(vertices.hits.normal[some]), vertices.back[some]
+        cosines = (normals @ lights.T).clamp(min=0) * lit[some]
         n_dot_v = (normals * back).sum(-1, keepdim=True)
         # Opposite directions have no bisector.
         l_dot_v = (back @ lights.T).clamp(min=-0.9999)
@@ -202,20 +200,6 @@ def _gather(
             spread[place, torch.arange(len(place))] = weights[name][some, 0]
             # Limit the contribution of one path, relative to its expected share. Larger values are only noise.
             radiance[name][pixels] += spread @ shaded.clamp(max=8.0)
-
-
-def _thin_out(
-    vertices: _Vertices, weights: dict[str, Tensor], full: float, generator: torch.Generator
-) -> tuple[_Vertices, dict[str, Tensor]]:
-    """Play Russian roulette.
-
-    A path survives with a probability equal to its remaining weight in the brightest material.
-    """
-    left = torch.stack(list(weights.values())).amax(dim=0)[:, 0] / full
-    chance = left.clamp(0.0, 1.0)
-    rows = (torch.rand(len(chance), generator=generator) < chance).nonzero()[:, 0]
-    survived = {name: weight[rows] / chance[rows, None] for name, weight in weights.items()}
-    return vertices.take(rows), survived
 
 
 LOBES = (0.0, 0.1, 0.0, 0.35)

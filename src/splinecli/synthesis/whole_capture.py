@@ -10,30 +10,10 @@ from torch.nn.functional import max_pool2d, pad
 
 from splinecli.restoration.images import restore_saturated
 from splinecli.restoration.lens_blur import remove_blur, surroundings
-from splinecli.synthesis.batches import (
-    CaptureConfig,
-    PixelBatch,
-    PixelTruth,
-    add_sensor_noise,
-    disturb_light_directions,
-    disturb_light_intensities,
-    draw_light_intensities,
-    photograph,
-    quantise,
-)
+from splinecli.synthesis import batches, draw_number
+from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.optics import draw_optics
-from splinecli.synthesis.random_numbers import draw_number
-
-_BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one that sets the exposure
-_GRAINY_SHARE = 1 / 3
-_MOST_SATURATED = 0.03  # largest share of clipped observations in an overexposed capture
-_UNMEASURED_SHARE = 0.3
-_MOST_UNMEASURED = 0.5
-"""Of the captures with intensity errors, the share with large ones, and the largest sigma of these in stops."""
-
-_MARGIN = 16  # most pixels added on each side of the object
-_WIDEST_RIM = 12  # most pixels by which an imprecise mask is too wide
 
 
 def photograph_captures(
@@ -49,7 +29,7 @@ def photograph_captures(
     See `photograph_scene` for the arguments. All pixels of a capture have the same directions, valid ones first.
     """
     if config.capture_pixels == 1:
-        return photograph(truth, radiance, directions, valid, config, generator)
+        return batches.photograph(truth, radiance, directions, valid, config, generator)
     captures = config.captures(len(radiance))
     observations, calibrated = torch.zeros_like(radiance), directions.clone()
     exposure = torch.ones_like(radiance[:, :1])
@@ -67,12 +47,17 @@ def photograph_captures(
 
 
 def photograph_scene(
-    radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
+    radiance: Tensor,
+    directions: Tensor,
+    config: CaptureConfig,
+    generator: torch.Generator,
+    mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, float]:
     """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture shares.
 
     Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
-    radiance to the observations.
+    radiance to the observations. With a mask (H, W), the radiance (H * W, F) is of whole images with a background, and
+    the observations are of the mask's pixels.
 
     Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the lights, as from room
     light, and of the capture's mean, as from lens glare; see `_ambient`.
@@ -84,32 +69,17 @@ def photograph_scene(
     if images are shifted by a fraction of a pixel or light scatters between neighbours. Of the captures with intensity
     errors, 30 % have an additional error with a sigma of U(0, 0.5) stops, as if the intensities had not been measured.
     The normals are then wrong by many degrees, but their detail is still correct.
+
+    `config.optics_share` of the captures of images use a camera from draw_optics, which mixes neighbouring pixels.
+    Saturation and noise are applied at the sensor, before the Bayer pattern is interpolated. As in `infer`, the blur is
+    estimated and removed.
     """
-    return _photograph(radiance, directions, config, generator, None)
-
-
-def photograph_images(
-    images: Tensor, mask: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor, float]:
-    """Photograph radiance images (F, H, W) with background; return the same as photograph_scene, for a mask's pixels.
-
-    `config.optics_share` of the captures use a camera from draw_optics, which mixes neighbouring pixels. Saturation and
-    noise are applied at the sensor, before the Bayer pattern is interpolated. As in `infer`, the blur is estimated and
-    removed.
-    """
-    return _photograph(images.flatten(1).T, directions, config, generator, mask)
-
-
-def _photograph(
-    radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator, mask: Tensor | None
-) -> tuple[Tensor, Tensor, float]:
-    """Photograph radiance (P, F) of the requested pixels or, with their mask (H, W), of all pixels of an image."""
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
-    intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
+    intensities = batches.draw_light_intensities(1, lights, config.unequal_lights_share, generator)
     arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
-    share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
+    share = uniform(1e-3, 0.03) if saturated else 1e-3  # of the observations that are clipped, or nearly
     around = None if mask is None else torch.from_numpy(surroundings(mask.numpy()))
     wanted: slice | Tensor = slice(None)
     if mask is not None and around is not None:
@@ -125,9 +95,9 @@ def _photograph(
     exposed = exposed.clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
-        grain = 10 ** uniform(-2.5, -1.2) * (uniform() < _GRAINY_SHARE)
+        grain = 10 ** uniform(-2.5, -1.2) * (uniform() < 1 / 3)
         exposed = exposed * (1 + grain * torch.randn(exposed.shape[-3:], generator=generator)).clamp(min=0)
-        exposed = add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
+        exposed = batches.add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
     is_jpeg = False
     if optics is not None:
         exposed, clipped = optics.develop(exposed), clipped.any(dim=0)
@@ -137,18 +107,18 @@ def _photograph(
     elif mask is not None:
         exposed, clipped = exposed[wanted], clipped[wanted]
     if config.sensor_noise and not is_jpeg:
-        exposed = quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
+        exposed = batches.quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
-    errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
-    if uniform() < _UNMEASURED_SHARE * config.light_intensity_error_share:
-        errors = errors * 2 ** (uniform(0, _MOST_UNMEASURED) * torch.randn(1, lights, generator=generator))
+    errors = batches.disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
+    if uniform() < 0.3 * config.light_intensity_error_share:
+        errors = errors * 2 ** (uniform(0, 0.5) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
     if mask is not None and around is not None:
         values = observed.contiguous().numpy()
         remove_blur(values, mask.numpy(), around.numpy())
         pixels = slice(0, int(mask.sum()))
         observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
-    calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
+    calibrated = batches.disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
     if saturated:
         values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
@@ -178,7 +148,7 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
     everything, the others are up to 12 pixels too wide.
     """
     uniform = partial(draw_number, generator)
-    sides = [int(uniform(0, _MARGIN + 1)) for _ in range(4)]
+    sides = [int(uniform(0, 17)) for _ in range(4)]
     maps, mask = pad(maps * mask, sides), pad(mask, sides)
     count, (height, width) = len(lights), mask.shape
     typical = maps[:count, mask].amax(dim=0).median()
@@ -200,7 +170,7 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
             behind[count:] = 0
     shown = torch.ones_like(mask)
     if uniform() < 0.5:
-        rim = 1 + int(uniform(0, _WIDEST_RIM))
+        rim = 1 + int(uniform(0, 12))
         shown = max_pool2d(mask[None].float(), 2 * rim + 1, stride=1, padding=rim)[0] > 0
     return torch.where(mask, maps, behind), shown
 

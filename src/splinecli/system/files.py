@@ -17,9 +17,7 @@ from typing import IO, Any
 from splinecli.errors import InputError, OutputError
 
 UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
-_PROBE = 1 << 12  # bytes of a file that are compared before the whole
 _MOST_JSON = 1 << 24  # bytes of a file
-_MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
 
 
 def free_name(name: str, is_taken: Callable[[str], bool], mark: str = "-") -> str:
@@ -46,7 +44,7 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
         if usual[size] > 1:
             with path.open("rb") as file:
                 file.seek(size // 2)  # the first rows of many images are black
-                alike[size, file.read(_PROBE)].append(place)
+                alike[size, file.read(1 << 12)].append(place)
     pairs = itertools.chain.from_iterable(itertools.combinations(places, 2) for places in alike.values())
     return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
 
@@ -135,8 +133,14 @@ def sync_names(folder: Path, *made: Path) -> None:
 
 def parse_json(text: str | bytes) -> Any:
     """Return the value of a JSON text. Raises ValueError, also if it is nested deeply or no float can hold a number."""
+
+    def whole_number(digits: str) -> int:
+        if len(digits) > 300:  # a float holds any of so many
+            raise ValueError(f"a number has {len(digits)} digits")
+        return int(digits)
+
     try:
-        return json.loads(text, parse_int=_whole_number)
+        return json.loads(text, parse_int=whole_number)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 
@@ -149,16 +153,10 @@ def is_special(path: Path) -> bool:
 def read_json(path: Path) -> Any:
     """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it is not a file."""
     if is_special(path):
-        raise ValueError("it is no file")
+        raise ValueError("it is not a file")
     if path.stat().st_size > _MOST_JSON:
         raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
     return parse_json(path.read_text("utf-8"))
-
-
-def _whole_number(digits: str) -> int:
-    if len(digits) > _MOST_DIGITS:
-        raise ValueError(f"a number has {len(digits)} digits")
-    return int(digits)
 
 
 class NoRoomError(OutputError):
@@ -198,12 +196,11 @@ def check_writable(folder: Path) -> None:
             place = place.parent
     except OSError as error:
         raise OutputError(f"cannot be a folder ({error.strerror})", path=folder) from error
+    hint = "Choose another place with -o"
     if not place.is_dir():
-        raise OutputError(
-            "found a file, expected a folder for the results", path=place, hint="Choose another place with -o"
-        )
+        raise OutputError("found a file, expected a folder for the results", path=place, hint=hint)
     if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError("no permission to write into this folder", path=place, hint="Choose another place with -o")
+        raise OutputError("no permission to write into this folder", path=place, hint=hint)
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
@@ -211,11 +208,8 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
     check_writable(folder)
     for name in () if overwrite else names:
         if (folder / name).exists():
-            raise OutputError(
-                f"{name} already exists in this folder",
-                path=folder,
-                hint="Add --overwrite, or choose another place with -o",
-            )
+            hint = "Add --overwrite, or choose another place with -o"
+            raise OutputError(f"{name} already exists in this folder", path=folder, hint=hint)
 
 
 def write_text(path: Path, content: str) -> None:
@@ -223,10 +217,7 @@ def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
-_OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
-
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
-
 StrPath = str | os.PathLike[str]  # a path in any form that the standard library takes
 
 
@@ -277,7 +268,8 @@ def is_found_file(path: Path) -> bool:
 def is_substitution(path: Path) -> bool:
     """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or standard input."""
     try:
-        return str(path).startswith(_OPEN_FILES) and stat.S_ISFIFO(path.stat().st_mode)
+        opened = str(path).startswith(("/dev/fd/", "/proc/self/fd/", "/dev/stdin"))
+        return opened and stat.S_ISFIFO(path.stat().st_mode)
     except (OSError, ValueError):
         return False
 

@@ -19,7 +19,7 @@ from splinecli.errors import SplinecliError, UsageError
 if TYPE_CHECKING:
     import torch
 
-
+# The message for each extra
 _PROBLEMS = {
     "cluster": "--workers above 1 and --cluster need the package distributed, which is not installed",
     "exr": "EXR files need the package OpenEXR, which is not installed",
@@ -29,7 +29,6 @@ _PROBLEMS = {
     "render": "rendering needs embreex and scikit-image, which are not all installed",
     "tensorboard": "--tensorboard needs the package tensorboard, which is not installed",
 }
-"""The message for each extra."""
 
 
 def import_extra(
@@ -53,10 +52,6 @@ def import_extra(
 
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
-_LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of malloc.h
-_LARGEST_KEPT, _MOST_KEPT = 2**27, 2**29  # bytes
-_NO_MEMORY = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
 _GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
 _MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it
@@ -101,24 +96,21 @@ def check_address_space() -> None:
 
     Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
     """
-    needed = _LIBRARIES + _BUFFER * (os.cpu_count() or 1)
+    needed = 1.5e9 + 64 * 2**20 * (os.cpu_count() or 1)
     if (most := _address_space_limit()) < needed:
-        raise SplinecliError(
-            f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v), but at least"
-            f" {needed / 1e9:.1f} GB are needed",
-            hint="Raise the limit",
-        )
+        limit = f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v)"
+        raise SplinecliError(f"{limit}, but at least {needed / 1e9:.1f} GB are needed", hint="Raise the limit")
 
 
 def keep_freed_memory() -> None:
     """Let the C library keep freed blocks for the next arrays, if it is glibc.
 
     By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
-    third of the time of networks and of reading. Blocks above _LARGEST_KEPT are still returned.
+    third of the time of networks and of reading. Blocks above 128 MiB are still returned.
     """
     mallopt = _of_c_library("mallopt")
-    for parameter, n_bytes in ((_MMAP_THRESHOLD, _LARGEST_KEPT), (_TRIM_THRESHOLD, _MOST_KEPT)):
-        mallopt(parameter, n_bytes)
+    mallopt(-3, 2**27)  # M_MMAP_THRESHOLD of malloc.h: the largest block that is kept
+    mallopt(-1, 2**29)  # M_TRIM_THRESHOLD: the most memory that is kept
 
 
 def return_freed_memory() -> None:
@@ -178,10 +170,9 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a library."""
-    text = str(error).lower()
-    return isinstance(error, MemoryError) or (
-        isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
-    )
+    text, of_library = str(error).lower(), isinstance(error, OSError | RuntimeError | ImportError)
+    known = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
+    return isinstance(error, MemoryError) or (of_library and any(words in text for words in known))
 
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -254,7 +245,6 @@ def cgroup_quotas() -> list[float]:
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-
 _lock, _users, _threads = Lock(), 0, 0
 
 

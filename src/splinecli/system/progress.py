@@ -1,35 +1,13 @@
 """Reports of a long computation: finished pixels, messages, stages and their seconds."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
-
+# The stages in order, except for page.html, which is one of the pictures but is written after the surface
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
-"""The stages in order, except for page.html, which is one of the pictures but is written after the surface."""
-
-
-class Clock:
-    """Adds up the seconds of stages, each of which ends where the next one begins. The first is reading."""
-
-    def __init__(self) -> None:
-        self._seconds = dict.fromkeys(STAGES, 0.0)
-        self._stage, self._since = STAGES[0], time.perf_counter()
-
-    def begin(self, stage: str) -> None:
-        """End the current stage and begin one of STAGES."""
-        now = time.perf_counter()
-        self._seconds[self._stage] += now - self._since
-        self._stage, self._since = stage, now
-
-    def seconds(self) -> dict[str, float]:
-        """Return the seconds of each stage so far, and of all together as `total`."""
-        self.begin(self._stage)
-        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
-            "total": round(sum(self._seconds.values()), 3)
-        }
 
 
 class Advance(Protocol):
@@ -38,11 +16,60 @@ class Advance(Protocol):
     def __call__(self, amount: float, note: str = "") -> None: ...
 
 
-class Observer:
-    """Receives messages, warnings and progress. This base class ignores them all.
+class Clock:
+    """Adds up the seconds of stages, and moves one progress bar, from 0 to 1, through all of them.
 
-    A subclass overrides the methods for anything it shows.
+    A stage ends where the next one begins. The first is reading.
     """
+
+    def __init__(self, show: Advance | None = None) -> None:
+        self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._stage, self._since = STAGES[0], time.perf_counter()
+        self._show, self._shares = show, dict[str, float]()
+        self._shown = self._end = 0.0  # places on the bar: now, and at the end of the stage
+
+    def expect(self, seconds: Mapping[str, float]) -> None:
+        """Divide the rest of the bar between stages by their expected seconds."""
+        whole = sum(seconds.values()) / (1 - self._end)
+        self._shares = {stage: each / whole for stage, each in seconds.items()}
+
+    def begin(self, stage: str, steps: float = 1.0, note: str = "") -> Advance:
+        """End the current stage and begin one of STAGES. Returns a function that counts its steps.
+
+        `note` is shown beside the bar.
+        """
+        now = time.perf_counter()
+        self._seconds[self._stage] += now - self._since
+        self._stage, self._since = stage, now
+        start, share = self._end, self._shares.pop(stage, 0.0)
+        self._end += share
+        done = 0.0
+
+        def advance(amount: float, note: str = note) -> None:
+            nonlocal done
+            done += amount
+            self._move(start + share * min(done / steps, 1.0), note)
+
+        advance(0.0)
+        return advance
+
+    def _move(self, place: float, note: str) -> None:
+        if self._show is not None:
+            self._show(max(0.0, place - self._shown), note)
+            self._shown = max(place, self._shown)
+
+    def seconds(self) -> dict[str, float]:
+        """Return the seconds of each stage so far, and of all together as `total`."""
+        now = time.perf_counter()
+        self._seconds[self._stage] += now - self._since
+        self._since = now
+        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
+            "total": round(sum(self._seconds.values()), 3)
+        }
+
+
+class Observer:
+    """Receives messages, warnings and progress, and ignores them. A subclass overrides what it shows."""
 
     def say(self, message: str) -> None:
         """Receive a message for the user."""

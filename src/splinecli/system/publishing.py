@@ -19,15 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.system.files import (
-    UNFINISHED,
-    check_writable,
-    create_hidden,
-    made_folder,
-    refusals_as_output_errors,
-    sync,
-    sync_names,
-)
+from splinecli.system import files
+from splinecli.system.files import UNFINISHED, check_writable, create_hidden, refusals_as_output_errors, sync
 
 LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
 
@@ -73,24 +66,21 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
         except PermissionError:
             if not path.exists():
                 raise
-            raise OutputError(
-                "this lock file belongs to another user, who may be writing into the folder",
-                path=path,
-                hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
-            ) from None
+            problem = "this lock file belongs to another user, who may be writing into the folder"
+            hint = "If no splinecli process of that user runs, remove the file. Otherwise choose another -o"
+            raise OutputError(problem, path=path, hint=hint) from None
         try:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
             return file
-        if got and _is_current(file, path):
-            return file
+        # The last owner of a lock file removes it, and others recreate it.
+        with suppress(FileNotFoundError):
+            if got and os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                return file
         file.close()
         if not got and not wait:
-            raise BusyError(
-                "another splinecli process is writing into this folder",
-                path=path.parent,
-                hint="Wait for it to end, or choose another -o",
-            )
+            problem, hint = "another splinecli process is writing into this folder", "Wait for it to end"
+            raise BusyError(problem, path=path.parent, hint=f"{hint}, or choose another -o")
         if not got:
             time.sleep(0.02)
 
@@ -132,16 +122,7 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-def _is_current(file: IO[str], path: Path) -> bool:
-    """Return whether an open file is still the one at the path: its last owner removes it, and others recreate it."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
-
-
 Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
-
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
 
@@ -156,9 +137,9 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
     check_writable(folder)
     with ExitStack() as stack:
         with refusals_as_output_errors(folder):
-            made = stack.enter_context(made_folder(folder))
+            made = stack.enter_context(files.made_folder(folder))
             stack.enter_context(locked(folder, wait=wait))
-            sync_names(folder, *made)
+            files.sync_names(folder, *made)
             left = []
             for path in folder.glob(f".*{UNFINISHED}"):
                 if not is_plain(path):
@@ -228,10 +209,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
     that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
-    Args:
-        report: the name of the file that describes the others: removed first, written last. None if the caller ensures
-            that no report names a file that changes.
-        stale: names of earlier files that are removed if no new file replaces them.
+    `report` names the file that describes the others: removed first, written last. It is None if the caller ensures
+    that no report names a file that changes. `stale` names earlier files that are removed if no new file replaces them.
     """
     new = NewFiles(folder)
     try:

@@ -78,11 +78,6 @@ def _lost_peers_as_model_errors() -> Iterator[None]:
         ) from error
 
 
-def is_launched() -> bool:
-    """Return whether torchrun started this process."""
-    return "TORCHELASTIC_RUN_ID" in os.environ or int(os.environ.get("WORLD_SIZE", "1")) > 1
-
-
 def restarts_are_allowed() -> bool:
     """Return whether torchrun restarts the processes when one fails. They then continue the run.
 
@@ -93,7 +88,7 @@ def restarts_are_allowed() -> bool:
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
     """Join the other processes, if torchrun started any; return the rank of this process and its device."""
-    if not is_launched():
+    if "TORCHELASTIC_RUN_ID" not in os.environ and int(os.environ.get("WORLD_SIZE", "1")) <= 1:
         return Workers(), device
     if device.type == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))

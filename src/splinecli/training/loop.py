@@ -17,24 +17,16 @@ from torch import Tensor
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
-from splinecli.synthesis.random_numbers import stream_seed
+from splinecli.synthesis import stream_seed
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.publishing import held_folder
-from splinecli.training.config import TrainingConfig
-from splinecli.training.config_files import Settings, check_resumable, configure
+from splinecli.training import run_files
+from splinecli.training.config import Settings, TrainingConfig, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
-from splinecli.training.run_files import (
-    Metrics,
-    RunCounters,
-    RunLog,
-    load_checkpoint,
-    none_for_nan,
-    read_checkpoint_config,
-    save_checkpoint,
-)
+from splinecli.training.run_files import Metrics, RunCounters, RunLog
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
 
 
@@ -47,10 +39,7 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network, which may have additional parts.
-
-    Additional parts can be an error head, refinement nets and layers that use the whole capture.
-    """
+    """Copy the weights into the network, which may also have an error head, refinement nets and capture context."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:
@@ -115,7 +104,7 @@ class Trainer:
         self.counters = RunCounters()
         if resume:
             state = self.network, self.average, self.optimizer
-            self.counters = load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
+            self.counters = run_files.load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
         if self.workers.leads and self.task.long_start:
             say(self.task.long_start)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
@@ -133,12 +122,8 @@ class Trainer:
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
         """Train to the end, saving regularly, and return the last metrics on the leader. A finished run is left alone.
 
-        Args:
-            report: called with progress and metrics at each entry of the log.
-
-        Raises:
-            ModelError: the loss or its gradient is no longer finite; the last checkpoint stays.
-            OutputError: a file cannot be written.
+        `report` is called with progress and metrics at each entry of the log. Raises ModelError if the loss or its
+        gradient is no longer finite; the last checkpoint stays. Raises OutputError if a file cannot be written.
         """
         metrics = None
         losses: dict[Part, list[Tensor]] = {}
@@ -154,8 +139,10 @@ class Trainer:
             if not (due or count >= REPORT_STEPS):
                 continue
             if self.workers.leads:
-                if due:
-                    self._check_weights()
+                if due:  # before the weights are saved
+                    for name, tensor in self.network.state_dict().items():
+                        if not torch.isfinite(tensor).all():
+                            raise self._not_finite(f"the tensor {name} is no longer finite")
                 means = [torch.stack(steps).mean(dim=0) for steps in losses.values()]
                 metrics = self._metrics(torch.stack(means), check=due)
                 self.log.append(metrics)
@@ -186,7 +173,11 @@ class Trainer:
             if not torch.isfinite(value):
                 raise self._not_finite(f"the {name} is {value.item()}")
         self.optimizer.step()
-        self._follow()
+        # Increase the decay with the steps; otherwise the average would depend on the initial weights for too long.
+        decay = min(config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
+        with torch.no_grad():
+            for averaged, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                averaged.lerp_(current, 1 - decay)
         self.counters.step += 1
         self.counters.pixels += config.batch_size
         return numbers
@@ -199,13 +190,7 @@ class Trainer:
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
         state = self.network, self.average, self.optimizer, self.counters
-        save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
-
-    def _check_weights(self) -> None:
-        """Raise ModelError if a weight is not finite, before it is saved."""
-        for name, tensor in self.network.state_dict().items():
-            if not torch.isfinite(tensor).all():
-                raise self._not_finite(f"the tensor {name} is no longer finite")
+        run_files.save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
 
     def _not_finite(self, problem: str) -> ModelError:
         lower = "a lower learning rate, such as --param learning_rate=1e-4"
@@ -213,13 +198,6 @@ class Trainer:
         if (self.folder / CHECKPOINT).exists():
             hint = f"The last checkpoint is kept. Use --resume with {lower}"
         return ModelError(f"{problem} at step {self.counters.step}", path=self.folder, hint=hint)
-
-    def _follow(self) -> None:
-        # Increase the decay with the steps; otherwise the average would depend on the initial weights for too long.
-        decay = min(self.config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
-        with torch.no_grad():
-            for averaged, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                averaged.lerp_(current, 1 - decay)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
         """Return the metrics from means (N, 6) over the steps of each part: both together, or NE-Net and LI-Net."""
@@ -233,10 +211,10 @@ class Trainer:
             learning_rate=self.optimizer.param_groups[0]["lr"],
             loss=float(summed.total),
             angle_deg=math.degrees(averaged.angle),
-            map_error=none_for_nan(float(averaged.on_map)),
-            masked_map_error=none_for_nan(float(averaged.masked)),
-            symmetric=none_for_nan(float(summed.symmetric)),
-            asymmetric=none_for_nan(float(summed.asymmetric)),
+            map_error=run_files.none_for_nan(float(averaged.on_map)),
+            masked_map_error=run_files.none_for_nan(float(averaged.masked)),
+            symmetric=run_files.none_for_nan(float(summed.symmetric)),
+            asymmetric=run_files.none_for_nan(float(summed.asymmetric)),
             validation_deg=checked_deg,
         )
 
@@ -251,7 +229,7 @@ def configure_run(
     """
     if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
         return configure(preset_name, file, changes), False
-    started = read_checkpoint_config(folder / CHECKPOINT)
+    started = run_files.read_checkpoint_config(folder / CHECKPOINT)
     asked = configure(preset_name, file, changes, base=started)
     check_resumable(started, asked, folder / CHECKPOINT)
     return asked, True

@@ -21,13 +21,8 @@ from splinecli.training.config import Norm, TrainingConfig
 
 Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
-
-TYPICAL_ERROR = math.radians(2.5)
-"""Added to the error of a capture before its loss is divided by the square root. Without this offset, captures that are
-already accurate would have too much weight."""
-
+# Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth.
 AXIS_LENGTH = 0.01
-"""Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth."""
 
 
 class Losses(NamedTuple):
@@ -64,11 +59,10 @@ def compute_losses(
 ) -> Losses:
     """Compute the losses of a batch (eqs. 5 and 8 of the paper; docs/train.md lists the terms).
 
-    LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
-    NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks
-    are updated, the losses are added and the angle is included only once. If pixels share captures, the angle is
-    divided by the square root of the capture's error. The loss of the error head is the negative log-likelihood of the
-    angle.
+    LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt); NE-Net:
+    arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks are updated, the losses are added
+    and the angle is included only once. If pixels share captures, the angle is divided by the square root of the
+    capture's error. The loss of the error head is the negative log-likelihood of the angle.
     """
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored))
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
@@ -175,16 +169,15 @@ def angles(normals: Tensor, truth: Tensor) -> Tensor:
 
 
 def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
-    """Return the mean error of captures (G,), each divided by the square root of its reference.
+    """Return the mean error of captures (G,) in radians, each divided by the square root of its reference.
 
-    An error of one degree thus has more weight in a capture that is already accurate.
-
-    Args:
-        error: in radians.
-        reference: errors (G,) that measure the difficulty of each capture; None to use `error`.
+    An error of one degree thus has more weight in a capture that is already accurate. The reference (G,), by default
+    `error`, measures the difficulty of each capture.
     """
     reference = error.detach() if reference is None else reference
-    return (math.sqrt(2 * TYPICAL_ERROR) * error / (reference + TYPICAL_ERROR).sqrt()).mean()
+    # Without this offset, captures that are already accurate would have too much weight.
+    typical = math.radians(2.5)
+    return (math.sqrt(2 * typical) * error / (reference + typical).sqrt()).mean()
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:

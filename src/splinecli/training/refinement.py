@@ -22,60 +22,28 @@ from splinecli.networks.weights import LoadedNetwork
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
 from splinecli.restoration.lens_blur import REACH
+from splinecli.synthesis import stream_seed
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
 from splinecli.synthesis.optics import scatter
-from splinecli.synthesis.random_numbers import stream_seed
-from splinecli.synthesis.whole_capture import add_background, photograph_images
+from splinecli.synthesis.whole_capture import add_background, photograph_scene
 from splinecli.training.objective import angles, balanced
 
+# Captures simulated before the first step. With 64, the net memorised them and was worse on others for half an hour.
 FIRST_EXAMPLES = 160
-"""Number of captures simulated before the first step. With 64, the net memorised them and was worse on other captures
-for half an hour."""
-
-STEPS_PER_EXAMPLE = 6
-"""Steps after which another capture is simulated, which takes about half of the training time on a CPU."""
-
-MOST_EXAMPLES = 2000
-"""Largest number of captures; later ones replace the oldest. Each takes about a megabyte."""
-
-CROP = 96
-"""Side of the crop that an example takes from a larger map, in pixels."""
-
-_ENLARGED_SHARE = 0.3
-_MOST_ENLARGED = 3.0
-"""The share of the scene captures that are enlarged, and the largest factor; the smallest is 1."""
-
-_BACKGROUND_SHARE = 0.35
-"""Share of the captures with a background behind the object; see add_background."""
-
-_DARK_MARGIN = REACH
-"""Width in pixels of the dark margin, which a lens and its inverse filter mix with the outline."""
-
-_SCATTERING_SHARE = 0.2
-"""Share of the captures of diffuse scenes with subsurface scattering; see scatter."""
-
-_ENGRAVED_SHARE = 0.4
-_ENGRAVED_SIZE = 80
-"""The share of captures of engraved pieces instead of scenes, and the size of these pieces; see draw_engraved."""
-
-ERROR_WEIGHT = 0.05
-"""Weight of the error likelihood relative to the angle in radians."""
+STEPS_PER_EXAMPLE = 6  # after which another capture is simulated: about half of the training time on a CPU
+MOST_EXAMPLES = 2000  # of about a megabyte each; later ones replace the oldest
+# Shares of the scene captures that are enlarged, and of all captures with a background and of engraved pieces.
+_ENLARGED_SHARE, _BACKGROUND_SHARE, _ENGRAVED_SHARE = 0.3, 0.35, 0.4
 
 
 class SceneMaps(NamedTuple):
-    """One capture of a rendered scene, after SPLINE-Net.
+    """One capture of a rendered scene, after SPLINE-Net."""
 
-    Attributes:
-        features: (CHANNELS, H, W) float16, see refine_features; zero outside the mask.
-        normals: (3, H, W) float16, ground truth; zero where unknown.
-        mask: (1, H, W) bool.
-    """
-
-    features: Tensor
-    normals: Tensor
-    mask: Tensor
+    features: Tensor  # (CHANNELS, H, W) float16, see refine_features; zero outside the mask
+    normals: Tensor  # (3, H, W) float16, ground truth; zero where unknown
+    mask: Tensor  # (1, H, W) bool
 
     def to(self, device: torch.device) -> SceneMaps:
         """Return the maps on a device."""
@@ -83,28 +51,19 @@ class SceneMaps(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A scene to be photographed.
+    """A scene to be photographed."""
 
-    Attributes:
-        maps: (F + 3, H, W), radiance under each light and true unit normals.
-        lights: (F, 3), unit directions.
-        mask: (H, W) bool.
-    """
-
-    maps: Tensor
-    lights: Tensor
-    mask: Tensor
+    maps: Tensor  # (F + 3, H, W), radiance under each light and true unit normals
+    lights: Tensor  # (F, 3), unit directions
+    mask: Tensor  # (H, W) bool
 
 
 class ScenePool:
     """Captures of scenes, each with its own lights and faults. The pool grows during training.
 
-    A capture depends only on (seed, its number).
-
-    Args:
-        scenes: pixel sets with some of their entries, and the weight of each set.
-        network: a SPLINE-Net with an error head, on the device of the captures.
-        first: the number of the first capture. A resumed run begins with its newest captures.
+    A capture depends only on (seed, its number). The scenes are pixel sets with some of their entries, and the weight
+    of each set; the network has an error head and is on the device of the captures. A resumed run begins with its
+    newest captures, of which `first` is the number of the first.
     """
 
     def __init__(
@@ -131,57 +90,62 @@ class ScenePool:
 
     def draw_scene(self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE) -> Scene:
         """Draw a part of a scene, or an engraved piece, and the lights of its capture."""
+        config = self.config
         if float(torch.rand((), generator=generator)) < engraved_share:
-            return self._draw_engraved(generator)
+            count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
+            lights = draw_light_directions(1, int(count), generator)[0]
+            truth, radiance, mask = draw_engraved(80, lights, generator)
+            return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
         weights = torch.tensor([weight for _, _, weight in self.scenes])
         pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
         entry = entries[int(torch.randint(len(entries), (), generator=generator))]
-        return self._draw_part(pixel_set, entry, generator)
-
-    def _draw_part(self, pixel_set: PixelSet, entry: Entry, generator: torch.Generator) -> Scene:
         pixels = pixel_set.load(entry)
         lights = torch.from_numpy(np.array(pixels.light_directions))
-        most = min(self.config.max_lights, entry.n_lights)
-        counts = draw_light_counts(1, self.config.min_lights, most, min(self.config.usual_lights, most), generator)
+        most = min(config.max_lights, entry.n_lights)
+        counts = draw_light_counts(1, config.min_lights, most, min(config.usual_lights, most), generator)
         chosen = choose_in_cone(lights, int(counts), generator)
         mask = torch.from_numpy(np.array(pixels.mask))
-        scale = 1 + (_MOST_ENLARGED - 1) * float(torch.rand((), generator=generator))
+        scale = 1 + 2.0 * float(torch.rand((), generator=generator))
         scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
-        box = _draw_box(mask, round(CROP / scale), generator)
+        # A part of the map around a random pixel of the object.
+        places, side = mask.nonzero(), round(96 / scale)
+        middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
+        bounds = zip(middle, places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist(), strict=True)
+        starts = [(max(low, min(at - side // 2, high - side)), high) for at, low, high in bounds]
+        box = tuple(slice(start, min(start + side, high)) for start, high in starts)
         kept = torch.zeros_like(mask)
         kept[box] = mask[box]
         rows = kept[mask].numpy()
         values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
         maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
-        scatters = torch.rand((), generator=generator) < _SCATTERING_SHARE * self.config.optics_share
+        scatters = torch.rand((), generator=generator) < 0.2 * config.optics_share
         if scatters and "-diffuse" in entry.name:
             maps[:-3] = scatter(maps[:-3], mask, generator)
         return Scene(maps, lights[chosen], mask)
-
-    def _draw_engraved(self, generator: torch.Generator) -> Scene:
-        config = self.config
-        count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
-        lights = draw_light_directions(1, int(count), generator)[0]
-        truth, radiance, mask = draw_engraved(_ENGRAVED_SIZE, lights, generator)
-        return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
 
     def _after_network(self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator) -> SceneMaps:
         """Photograph maps (F + 3, H, W) of radiance and true normals, and return SPLINE-Net's estimates."""
         if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
-        else:
-            maps, mask = pad(maps * mask, (_DARK_MARGIN,) * 4), pad(mask, (_DARK_MARGIN,) * 4)
+        else:  # a dark margin, which a lens and its inverse filter mix with the outline
+            maps, mask = pad(maps * mask, (REACH,) * 4), pad(mask, (REACH,) * 4)
         truth = torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-        observations, lights, _ = photograph_images(maps[:-3], mask, lights, self.config, generator)
+        observations, lights, _ = photograph_scene(maps[:-3].flatten(1).T, lights, self.config, generator, mask)
         features = pixel_features(self.network, observations, lights, mask)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, rotate and mirror each, and stack them as float32 (count, ...)."""
-        drawn = [
-            _turned(self.examples[int(index)], generator)
-            for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device)
-        ]
+        drawn = []
+        for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device):
+            example = self.examples[int(index)]
+            draw = torch.rand(3, generator=generator, device=generator.device).tolist()
+            turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
+            features = turn_features(example.features, turn).clone()
+            if draw[2] < 0.5:
+                features[channels("halves")].neg_()
+            normals = turn_maps(example.normals, turn, vectors=((0, 1),))
+            drawn.append(SceneMaps(features, normals, turn_maps(example.mask, turn)))
         return stack_maps(drawn)
 
 
@@ -203,16 +167,6 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
     weighed = torch.cat((maps * mask, mask[None].float()))
     found = torch.nn.functional.interpolate(weighed[None], scale_factor=scale, mode="bilinear")[0]
     return found[:-1] / found[-1:].clamp(min=0.5), found[-1] > 0.5
-
-
-def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slice, slice]:
-    """Return a part of a map, at most `side` pixels wide and high, around a random pixel of the object."""
-    places = mask.nonzero()
-    middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
-    lowest, highest = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
-    starts = [max(low, min(at - side // 2, high - side)) for at, low, high in zip(middle, lowest, highest, strict=True)]
-    top, left = (slice(start, min(start + side, high)) for start, high in zip(starts, highest, strict=True))
-    return top, left
 
 
 @torch.no_grad()
@@ -251,19 +205,6 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
             torch.stack([pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2])) for maps in field])
             for field in zip(*captures, strict=True)
         )
-    )
-
-
-def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
-    draw = torch.rand(3, generator=generator, device=generator.device).tolist()
-    turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
-    features = turn_features(example.features, turn).clone()
-    if draw[2] < 0.5:
-        features[channels("halves")].neg_()
-    return SceneMaps(
-        features,
-        turn_maps(example.normals, turn, vectors=((0, 1),)),
-        turn_maps(example.mask, turn),
     )
 
 
@@ -307,5 +248,5 @@ def refinement_losses(
         both = known.narrow(axis, 1, known.shape[axis] - 1) & known.narrow(axis, 0, known.shape[axis] - 1)
         off = (normals - maps.normals).diff(dim=axis + 1).square().sum(dim=1).add(1e-8).sqrt()
         detail = detail + mean_over_capture(off, both) / 2
-    total = balanced(after + detail_weight * detail, before) + ERROR_WEIGHT * surprise.mean()
+    total = balanced(after + detail_weight * detail, before) + 0.05 * surprise.mean()
     return RefinementLosses(total, before.mean(), after.mean())

@@ -48,7 +48,6 @@ class Metrics:
 
 
 _HEADER = ",".join(field.name for field in fields(Metrics))
-_LONGEST = 1 << 26  # largest metrics.csv in bytes, about half a million lines
 
 
 class RunLog:
@@ -61,7 +60,12 @@ class RunLog:
         """
         self.folder = folder
         self.set_aside = _drop_lines_after(step, folder / METRICS)
-        self._events: Any = _open_events(folder / EVENTS, step) if tensorboard else None
+        self._events: Any = None
+        if tensorboard:
+            refuse_link(folder / EVENTS)
+            writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter
+            with refusals_as_output_errors(folder / EVENTS):
+                self._events = writer(str(folder / EVENTS), purge_step=step + 1)
 
     def append(self, metrics: Metrics) -> None:
         """Add a line to metrics.csv and to TensorBoard's event file."""
@@ -137,8 +141,8 @@ def _lines_until(step: int, path: Path) -> list[str]:
     """Return the lines up to a step, without the last one if a full disk has cut it. Raises ValueError."""
     if not path.exists():
         return []
-    if not path.is_file() or path.stat().st_size > _LONGEST:
-        raise ValueError("it is no such file")
+    if not path.is_file() or path.stat().st_size > 1 << 26:  # about half a million lines
+        raise ValueError("it is not a checkpoint")
     header, *lines = path.read_text("utf-8").splitlines()
     if header != _HEADER:
         raise ValueError("another version wrote it")
@@ -153,15 +157,7 @@ def _lines_until(step: int, path: Path) -> list[str]:
     return kept
 
 
-def _open_events(folder: Path, step: int) -> Any:
-    refuse_link(folder)
-    writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter
-    with refusals_as_output_errors(folder):
-        return writer(str(folder), purge_step=step + 1)
-
-
 FORMAT = "splinecli-checkpoint-2"
-_COUNTERS_KEY = "clock"  # the key of this entry in checkpoints of all versions so far
 
 
 @dataclass
@@ -191,13 +187,12 @@ def save_checkpoint(
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
-    plain = {
-        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
-    }
+    contiguous = torch.contiguous_format
+    plain = {name: tensor.detach().cpu().clone(memory_format=contiguous) for name, tensor in tensors.items()}
     metadata = {
         "format": FORMAT,
         "config": json.dumps(config.to_dict()),
-        _COUNTERS_KEY: json.dumps(asdict(counters)),
+        "clock": json.dumps(asdict(counters)),
         "sets": json.dumps(sets),
         "tensors_sha256": tensors_sha256(plain),
     }
@@ -233,7 +228,7 @@ def load_checkpoint(
             index, _, key = name.partition(".")
             states.setdefault(int(index), {})[key] = tensor
         optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-        counters = RunCounters(**read_json_entry(metadata, _COUNTERS_KEY, path))
+        counters = RunCounters(**read_json_entry(metadata, "clock", path))
         return RunCounters(int(counters.step), int(counters.pixels), float(counters.seconds))
     except (TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error

@@ -20,9 +20,9 @@ from splinecli.maths.normals import angle_between_deg
 from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.pixel_sets.source import PixelSetSource
 from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
+from splinecli.synthesis import stream_seed
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
-from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.objective import Losses, angles, compute_losses, dense_truth_in_frame, fixed, part_of_step
 from splinecli.training.refinement import FIRST_EXAMPLES, STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
@@ -61,10 +61,7 @@ def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], l
 
 
 PixelSource = PixelGenerator | PixelSetSource | MixedSource
-"""Draws batches of pixels. Its random generator determines the batches."""
-
-Scenes = dict[str, tuple[PixelSet, list[Entry]]]
-"""The pixel sets of a run by path, each with its entries for training or for validation."""
+Scenes = dict[str, tuple[PixelSet, list[Entry]]]  # by path, each with its entries for training or for validation
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,18 @@ def open_sets(config: TrainingConfig) -> OpenSets:
     """
     names = [name for name, weight in config.sources.items() if weight > 0 and name != GENERATOR]
     sets = {name: open_pixel_set(Path(name)) for name in names}
-    parts = _split_sets(sets, config.held_share)
+    parts = {name: split_scenes(pixel_set.entries, config.held_share) for name, pixel_set in sets.items()}
+    # Two sets may contain the same shape. A shape that one of them uses for validation is not used for training.
+    shapes = {entry.sha256["normals"] for _, validation in parts.values() for entry in validation}
+    for name, (training, validation) in parts.items():
+        kept = [entry for entry in training if entry.sha256["normals"] not in shapes]
+        if not kept:
+            raise InputError(
+                "all scenes of the set are used for validation, here or in another set",
+                path=name,
+                hint="Name each set once, or set held_share to 0",
+            )
+        parts[name] = kept, validation
     return OpenSets(
         {name: (sets[name], training) for name, (training, _) in parts.items()},
         {name: (sets[name], validation or training) for name, (training, validation) in parts.items()},
@@ -111,25 +119,6 @@ def pixel_source(
         for name in weights
     ]
     return opened[0] if len(opened) == 1 else MixedSource(opened, list(weights.values()), generator)
-
-
-def _split_sets(sets: dict[str, PixelSet], share: float) -> dict[str, tuple[list[Entry], list[Entry]]]:
-    """Return training and validation entries of each set, with no shape in both.
-
-    Two sets may contain the same shape. A shape that one of them uses for validation is not used for training.
-    """
-    parts = {name: split_scenes(pixel_set.entries, share) for name, pixel_set in sets.items()}
-    shapes = {entry.sha256["normals"] for _, validation in parts.values() for entry in validation}
-    for name, (training, validation) in parts.items():
-        kept = [entry for entry in training if entry.sha256["normals"] not in shapes]
-        if not kept:
-            raise InputError(
-                "all scenes of the set are used for validation, here or in another set",
-                path=name,
-                hint="Name each set once, or set held_share to 0",
-            )
-        parts[name] = kept, validation
-    return parts
 
 
 VALIDATION_PIXELS = 2048

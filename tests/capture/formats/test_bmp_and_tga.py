@@ -40,8 +40,7 @@ def test_damage(tmp_path: Path, suffix: str) -> None:
 
 
 def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
-    lights = ring_lights(6)
-    pictures = np.full((6, 4, 5), 100, np.uint8)
+    pictures, lights = np.full((6, 4, 5), 100, np.uint8), ring_lights(6)
     folder = write_capture(tmp_path / "owl", pictures, lights, names="owl.{}.png")
     Image.fromarray(RGB).save(folder / "owl.mask.bmp")
     Image.fromarray(RGB).save(folder / "owl_normal.tga")
@@ -49,23 +48,17 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
     assert capture.n_lights == 6
     (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
     assert str(found).startswith("owl.mask.bmp and 1 more: left out")
+    # If all of them have such names, these say nothing.
+    assert read_capture(write_capture(tmp_path / "a", pictures, lights, names="mask_of_a_king_{}.png")).n_lights == 6
 
 
 def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "owl", np.full((6, 4, 5), 100, np.uint8), ring_lights(6))
-    whole = read_capture(folder)
     Image.fromarray(RGB[:2]).save(folder / "thumb.png")
     capture = read_capture(folder)
-    np.testing.assert_array_equal(capture.observations, whole.observations)
+    assert (capture.n_lights, capture.mask.shape) == (6, (4, 5))
     (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
     assert str(found).startswith("thumb.png: left out, because light_directions.txt has no light for it")
     Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "006.png")
     with pytest.raises(InputError, match="found 6 light directions, expected 8"):
         read_capture(folder)
-
-
-def test_photographs_may_have_such_names(tmp_path: Path) -> None:
-    """All of them: then these names say nothing."""
-    pictures = np.full((6, 4, 5), 100, np.uint8)
-    folder = write_capture(tmp_path / "a", pictures, ring_lights(6), names="mask_of_a_king_{}.png")
-    assert read_capture(folder).n_lights == 6

@@ -10,7 +10,6 @@ import scipy.io
 import tifffile
 from numpy.typing import NDArray
 
-from capture.conftest import WriteImage
 from splinecli.capture import read_normal_map
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.numbers import read_mat
@@ -67,12 +66,9 @@ def test_pictures(write_image, tmp_path, normals, name, bits, error_deg):
     np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
 
 
-def test_a_gray_background_is_no_normal(write_image: WriteImage, normals: NDArray[np.float64]) -> None:
+def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(tmp_path, write_image, normals):
     picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)  # zero vectors become 128, 128, 128
     assert not read_normals(write_image("a.png", picture), np.ones(SHAPE, bool))[1, 2].any()
-
-
-def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(tmp_path, normals):
     stored = normals.copy()
     stored[0] = [0, 0, 1]
     stored[2, 3] = [np.nan, 0, 1]
@@ -103,18 +99,17 @@ def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray
         read_normals(path, MASK)
 
 
-@pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.tif", "a.txt"])
-def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> None:
-    message = "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in the images"
-    if name == "a.txt":
-        message = "found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
-    with pytest.raises(InputError, match=message):
-        read_normals(write(tmp_path / name, normals[1:]), MASK)
-
-
-def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_damaged_and_unknown_files_and_other_sizes(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    sizes = dict.fromkeys(("a.mat", "a.npy", "a.tif"), "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in")
+    sizes["a.txt"] = "found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
+    for name, message in sizes.items():
+        with pytest.raises(InputError, match=message):
+            read_normals(write(tmp_path / name, normals[1:]), MASK)
     with pytest.raises(InputError, match="does not exist"):
-        read_normals(tmp_path / "a.npy", MASK)
+        read_normals(tmp_path / "none.npy", MASK)
+    np.save(tmp_path / "pickled.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="contains no array of numbers"):
+        read_normals(tmp_path / "pickled.npy", MASK)
     for name, message in [("a.mat", "MATLAB file is damaged"), ("a.npy", r"\.npy file is damaged")]:
         path = write(tmp_path / name, normals)
         path.write_bytes(path.read_bytes()[:150])
@@ -137,25 +132,14 @@ def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArra
     np.testing.assert_allclose(read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7)
 
 
-def test_nothing_is_unpickled(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="contains no array of numbers"):
-        read_normals(tmp_path / "a.npy", MASK)
-
-
-@pytest.mark.parametrize("bits", [8, 16])
-def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
-    picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
-    path = write_image("photograph.png", picture)
-    with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"):
-        read_normal_map(path)
-
-
-def test_a_huge_value_of_a_damaged_file_overflows_nothing(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(tmp_path, write_image, normals):
+    for bits in (8, 16):
+        picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
+        with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are not normals"):
+            read_normal_map(write_image("photograph.png", picture))
     damaged = normals.astype(np.float32)
     damaged[3, 4] = 1e30
-    np.save(tmp_path / "a.npy", damaged)
-    np.testing.assert_allclose(np.linalg.norm(read_normal_map(tmp_path / "a.npy")[3, 4]), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(read_normal_map(write(tmp_path / "a.npy", damaged))[3, 4]), 1, atol=1e-6)
 
 
 def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
@@ -181,21 +165,17 @@ def test_matlab_s_numbers_are_those_that_scipy_reads(tmp_path: Path, dtype: str,
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_matlab_s_files_of_either_byte_order(tmp_path: Path, order: str, compressed: bool) -> None:
+def test_matlab_s_byte_orders_and_undefined_types(tmp_path: Path, compressed: bool) -> None:
+    """Of an undefined type, SciPy's reader ends the process."""
     values = np.arange(60.0).reshape(*SHAPE, 3)
-    path = write_mat(tmp_path / "a.mat", values, order, kind=9, compressed=compressed)
-    np.testing.assert_array_equal(read_mat(path, None), values)
-    np.testing.assert_array_equal(scipy.io.loadmat(path)["N"], values)
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("kind", [0, 8, 10, 14, 15, 16, 20, 200, 65_535])
-def test_matlab_s_undefined_types_are_refused(tmp_path: Path, kind: int, compressed: bool) -> None:
-    """SciPy's reader ends the process."""
-    path = write_mat(tmp_path / "a.mat", np.zeros((*SHAPE, 3)), "<", kind=kind, compressed=compressed)
-    with pytest.raises(InputError, match="the MATLAB file is damaged and cannot be read"):
-        read_normals(path, MASK)
+    for order in "<>":
+        path = write_mat(tmp_path / "a.mat", values, order, kind=9, compressed=compressed)
+        np.testing.assert_array_equal(read_mat(path, None), values)
+        np.testing.assert_array_equal(scipy.io.loadmat(path)["N"], values)
+    for kind in (0, 8, 10, 14, 15, 16, 20, 200, 65_535):
+        write_mat(path, values, "<", kind=kind, compressed=compressed)
+        with pytest.raises(InputError, match="the MATLAB file is damaged and cannot be read"):
+            read_normals(path, MASK)
 
 
 def write_mat(path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool) -> Path:

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.files import AMBIENT, MASK, find_named, list_images
 from splinecli.capture.formats.facts import Exposure, find_exposure, read_header
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
@@ -122,13 +121,6 @@ def test_values_are_proportional_to_light(tmp_path: Path, black: Sequence[int]) 
 
 
 @pytest.mark.usefixtures("needs_rawpy")
-def test_channels_are_red_green_blue_of_the_camera(tmp_path: Path) -> None:
-    light = np.broadcast_to((0.2, 0.5, 0.3), (30, 40, 3))
-    pixels = decode_image(write_dng(tmp_path / "a.dng", mosaic(light)))
-    np.testing.assert_allclose(pixels[10, 10] / 65535, (0.2, 0.5, 0.3), atol=1e-4)
-
-
-@pytest.mark.usefixtures("needs_rawpy")
 def test_white_balance_and_orientation_of_the_shot_do_not_count(tmp_path: Path) -> None:
     sensor = mosaic(ramp())
     first = decode_image(write_dng(tmp_path / "a.dng", sensor))
@@ -155,11 +147,13 @@ def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, blac
 
 @pytest.mark.usefixtures("needs_rawpy")
 @pytest.mark.parametrize("colour", [(0.2, 0.5, 0.3), (0.4,)])
-def test_sensors_without_bayer_filter(tmp_path: Path, colour: tuple[float, ...]) -> None:
+def test_channels_are_red_green_blue_of_the_camera_and_sensors_without_bayer_filter(tmp_path, colour):
     light = np.broadcast_to(colour, (30, 40, len(colour)))
     pixels = decode_image(write_dng(tmp_path / "a.dng", np.round(light * WHITE)))
     assert pixels.shape == light.shape
     np.testing.assert_allclose(pixels / 65535, light, atol=1e-4)
+    filtered = decode_image(write_dng(tmp_path / "b.dng", mosaic(np.broadcast_to(colour, (30, 40, 3)))))
+    np.testing.assert_allclose(filtered[10, 10] / 65535, np.broadcast_to(colour, 3), atol=1e-4)
 
 
 @pytest.mark.usefixtures("without_rawpy")
@@ -170,41 +164,26 @@ def test_rawpy_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("needs_rawpy")
-@pytest.mark.parametrize("kept", [10, 200, 600, 3000])
-def test_damaged_files(tmp_path: Path, kept: int, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_files(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = write_dng(tmp_path / "whole.dng", mosaic(ramp())).read_bytes()
-    (tmp_path / "cut.dng").write_bytes(whole[:kept])
-    with pytest.raises(InputError, match=r"cut\.dng: the RAW file is damaged"):
-        decode_image(tmp_path / "cut.dng")
+    for kept in (10, 200, 600, 3000):
+        (tmp_path / "cut.dng").write_bytes(whole[:kept])
+        with pytest.raises(InputError, match=r"cut\.dng: the RAW file is damaged"):
+            decode_image(tmp_path / "cut.dng")
     assert capfd.readouterr() == ("", "")
 
 
-def touch(folder: Path, *names: str) -> None:
-    for name in names:
-        (folder / name).touch()
-
-
-def names_of(images: Sequence[Path]) -> list[str]:
-    return [image.name for image in images]
-
-
 def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
-    touch(tmp_path, "img2.NEF", "IMG2.jpg", "img10.nef", "img10.tif", "img10.jpg", "img3.png", "img3.jpg", "notes.txt")
-    listed = list_images(tmp_path, leave_out_stems=(), leave_out=())
-    # Of img2 the RAW file and not the camera's copy, of img10 what was developed, of img3 the PNG.
-    assert names_of(listed) == ["img2.NEF", "img3.png", "img10.tif"]
-
-
-def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
-    touch(tmp_path, "ambient.NEF", "ambient.jpg", "mask.nef", "mask.png", "a.nef", "b.nef", "c.nef")
+    """Ambient images may be RAW, masks not."""
+    names = "img2.NEF IMG2.jpg img10.nef img10.tif img10.jpg img3.png img3.jpg notes.txt"
+    for name in f"{names} ambient.NEF ambient.jpg mask.nef mask.png".split():
+        (tmp_path / name).touch()
     (tmp_path / "lights.txt").write_text(LIGHTS)
-    assert find_named(tmp_path, AMBIENT) == tmp_path / "ambient.NEF"
-    assert find_named(tmp_path, MASK) == tmp_path / "mask.png"
     source = open_capture(tmp_path)
-    assert names_of(source.files.images) == ["a.nef", "b.nef", "c.nef"]
-    assert source.files.ambient == tmp_path / "ambient.NEF"
-    (warning,) = source.warnings
-    assert str(warning) == "ambient.NEF was subtracted from all images as ambient light."
+    # Of img2 the RAW file and not the camera's copy, of img10 what was developed, of img3 the PNG.
+    assert [image.name for image in source.files.images] == ["img2.NEF", "img3.png", "img10.tif"]
+    assert (source.files.ambient, source.files.mask) == (tmp_path / "ambient.NEF", tmp_path / "mask.png")
+    assert "ambient.NEF was subtracted from all images as ambient light." in map(str, source.warnings)
 
 
 @pytest.mark.usefixtures("without_rawpy")

@@ -84,14 +84,6 @@ def stderr_is_apart() -> bool:
         return True
 
 
-_LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
-_LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture
-
-_MOST_PAGES = 10_000
-_LONGEST_TAG = 1 << 24  # values, such as the bytes of a colour profile
-_MOST_PARTS = 1 << 18  # strips or tiles
-_PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or tile
-
 # Values of TIFF's PhotometricInterpretation, the meaning of a sample.
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
@@ -100,13 +92,19 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
     """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one that OpenCV decodes.
 
     Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
-    every sample format, but has no decoder for some compressions (LZW).
-
-    Raises:
-        InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
+    every sample format, but has no decoder for some compressions (LZW). Raises InputError if the file is truncated,
+    damaged, or of a kind without linear gray or RGB values.
     """
     with first_page(file, path) as page:
-        _check_complete(page, os.fstat(file.fileno()).st_size, path)
+        # A part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture. Empty
+        # parts have up to 2^16 bytes, such as the tables of a JPEG, and tiles up to 2^24 more than the picture.
+        expanded = math.prod(page.chunks) * page.dtype.itemsize
+        if expanded > 2 * page.nbytes + (1 << 24) or max(page.databytecounts, default=0) > 2 * expanded + (1 << 16):
+            raise ValueError
+        size = os.fstat(file.fileno()).st_size
+        parts = zip(page.dataoffsets, page.databytecounts, strict=True)
+        if any(count == 0 or offset + count > size for offset, count in parts):
+            raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
             problem = f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
@@ -136,7 +134,7 @@ def pages(path: Path) -> list[Path]:
             count = len(page.parent.pages)
     except (InputError, OSError):
         return [path]
-    return [path.with_name(f"{path.name}[{number}]") for number in range(count)] if 1 < count < _MOST_PAGES else [path]
+    return [path.with_name(f"{path.name}[{number}]") for number in range(count)] if 1 < count < 10_000 else [path]
 
 
 @contextmanager
@@ -171,7 +169,8 @@ def _check_tags(file: BinaryIO, number: int) -> None:
         for place in range(0, len(entries), entry):
             tag = int.from_bytes(entries[place : place + 2], order)
             values = int.from_bytes(entries[place + 4 : place + 4 + bytes_of], order)
-            if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
+            # Tags with one value for each strip or tile; others, such as colour profiles, have more.
+            if values > (1 << 18 if tag in (273, 279, 324, 325) else 1 << 24):
                 raise ValueError
         following = file.read(8 if big else 4)
 
@@ -191,18 +190,6 @@ def _decode_page(page: Any) -> Array | None:
     return pixels if pixels.ndim in (2, 3) else None
 
 
-def _check_complete(page: Any, size: int, path: Path) -> None:
-    """Raise an error if a part of the pixels is beyond the file's size in bytes, or is longer than its pixels."""
-    # Such a part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture.
-    expanded = math.prod(page.chunks) * page.dtype.itemsize
-    longest = 2 * expanded + _LONGEST_EMPTY_PART
-    if expanded > 2 * page.nbytes + _LARGEST_EMPTY_PART or max(page.databytecounts, default=0) > longest:
-        raise ValueError
-    parts = zip(page.dataoffsets, page.databytecounts, strict=True)
-    if any(count == 0 or offset + count > size for offset, count in parts):
-        raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
-
-
 RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
@@ -220,10 +207,8 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
     """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
 
     They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
-    camera at one setting have the same scale. An orientation is ignored, as in all images.
-
-    Raises:
-        InputError: rawpy is not installed, or LibRaw cannot read the file.
+    camera at one setting have the same scale. An orientation is ignored, as in all images. Raises InputError if rawpy
+    is not installed, or LibRaw cannot read the file.
     """
     with _libraw(path) as rawpy:
         with native_stderr():  # kept short, because it also blocks progress bars

@@ -17,16 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
-from splinecli.capture.formats.decoders import (
-    COPY_AGAIN,
-    DAMAGED,
-    RAW_SUFFIXES,
-    damage_as_input_error,
-    first_page,
-    page_of,
-    raw_size,
-    read_shot,
-)
+from splinecli.capture.formats import decoders
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, LARGEST_PROFILE, SRGB, TransferCurve, profile_curve
 from splinecli.system.files import check_file, reading
@@ -47,15 +38,9 @@ _PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")  # w
 StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as stored, and the bytes of each number
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
-_KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
-"""EXIF tags of the exposure and of the focal length; see Exposure and calibration/balls.py."""
-
-_MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF and DNG
-
-_MOST_PARTS = 10_000
-"""Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
-
-_RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
+_EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
+_KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)  # also of the focal length; see balls.py
+_MOST_PARTS = 10_000  # chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
 
 
 @dataclass(frozen=True)
@@ -67,8 +52,8 @@ class StatedCurve:
     unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
-_FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
-_CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: _ENCODED}
+_ENCODED = StatedCurve(SRGB, "PNG that says so")
+_CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a film")) | {8: StatedCurve(), 13: _ENCODED}
 """Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over all others."""
 
 
@@ -98,9 +83,9 @@ class ImageHeader:
         if self.damage is not None:
             raise self.damage
         if self.kind == "RAW":
-            return raw_size(self.path)
+            return decoders.raw_size(self.path)
         if self.stated_size is None:
-            raise InputError(f"the {self.kind} is truncated", path=self.path, hint=COPY_AGAIN)
+            raise InputError(f"the {self.kind} is truncated", path=self.path, hint=decoders.COPY_AGAIN)
         return self.stated_size
 
 
@@ -116,7 +101,7 @@ def read_header(path: Path) -> ImageHeader:
 @contextmanager
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
     """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
-    stored, _ = page_of(path)
+    stored, _ = decoders.page_of(path)
     check_file(stored, "an image")
     with reading(path), stored.open("rb") as file:
         start, suffix = file.read(12), path.suffix.lower()
@@ -127,7 +112,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
             found = _BRANDS.get(start[8:], found)
-        kind = "RAW" if suffix in RAW_SUFFIXES else found
+        kind = "RAW" if suffix in decoders.RAW_SUFFIXES else found
         if kind is None:
             raise InputError("found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path)
         yield file, kind
@@ -137,7 +122,7 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
     """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
-        return ImageHeader(path, kind, white_level=_RAW_WHITE, exif=exif)
+        return ImageHeader(path, kind, white_level=65_535, exif=exif)  # of developed RAW files; see decode_raw
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)
@@ -148,20 +133,16 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
             exif = _exif_tags(lambda tags: tags.load(picture.info.get("exif") or b""))
             return ImageHeader(path, kind, size, curve, exif=exif)
     if kind in ("PGM", "PPM"):
-        width, height, most, _ = pnm_header(file.read(_LONGEST_HEADER)) or (0, 0, 0, 0)
+        width, height, most, _ = pnm_header(file.read(4096)) or (0, 0, 0, 0)
         shape = (height, width, 1 if kind == "PGM" else 3)
         level = most if 255 < most < 65_535 else None
         return ImageHeader(path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level)
-    read = {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind]
-    return read(file, path)
-
-
-_LONGEST_HEADER = 4096  # bytes of a PGM or PPM before its pixels
+    return {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind](file, path)
 
 
 def pnm_header(start: bytes) -> tuple[int, int, int, int] | None:
     """Return width, height, largest value and place of the pixels of a PGM or PPM; None for a damaged one."""
-    found = _PNM.match(start[:_LONGEST_HEADER])
+    found = _PNM.match(start[:4096])
     return None if found is None else (int(found[1]), int(found[2]), int(found[3]), found.end())
 
 
@@ -173,7 +154,7 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
     if kind == "HEIF":
         otherwise = "export the photographs as 16-bit TIFF or PNG"
         import_extra("pillow_heif", "heif", error=InputError, path=path, otherwise=otherwise).register_heif_opener()
-    with damage_as_input_error(path, DAMAGED), warnings.catch_warnings():
+    with decoders.damage_as_input_error(path, decoders.DAMAGED), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures, which are checked later
         yield Image.open(file, formats=[kind])
 
@@ -181,8 +162,13 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
 def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
     file.seek(len(PNG))
     chunks: dict[bytes, bytes] = {}
-    for name, content in _png_chunks(file):
-        chunks.setdefault(name, content)
+    for _ in range(_MOST_PARTS):
+        if len(start := file.read(8)) < 8 or start[4:] in (b"IDAT", b"IEND"):
+            break
+        length = int.from_bytes(start[:4], "big")
+        content = file.read(min(length, LARGEST_PROFILE if start[4:] in (b"iCCP", b"eXIf") else 16))
+        file.seek(length - len(content) + 4, 1)
+        chunks.setdefault(start[4:], content)
     header, size = chunks.get(b"IHDR", b""), None
     if next(iter(chunks), None) == b"IHDR" and len(header) >= 10:
         width, height = (int.from_bytes(header[place : place + 4], "big") for place in (0, 4))
@@ -204,17 +190,6 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
     return ImageHeader(path, "PNG", size, curve, level, _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))))
-
-
-def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """Yield name and content of the chunks before a PNG's pixels, with the file behind the signature."""
-    for _ in range(_MOST_PARTS):
-        if len(header := file.read(8)) < 8 or header[4:] in (b"IDAT", b"IEND"):
-            return
-        length = int.from_bytes(header[:4], "big")
-        content = file.read(min(length, LARGEST_PROFILE if header[4:] in (b"iCCP", b"eXIf") else 16))
-        file.seek(length - len(content) + 4, 1)
-        yield header[4:], content
 
 
 def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
@@ -257,14 +232,14 @@ def _is_frame(marker: int) -> bool:
 
 
 def _tiff_facts(file: BinaryIO, path: Path) -> ImageHeader:
-    with first_page(file, path) as page:
+    with decoders.first_page(file, path) as page:
         bits = int(page.bitspersample)
         size = (page.imagelength, page.imagewidth, page.samplesperpixel), -(-bits // 8)
-        tag, profile = page.tags.get(_PROFILE), None
+        tag, profile = page.tags.get(34675), None
         if tag is not None:
             value = tag.value if tag.count <= LARGEST_PROFILE else b""
             profile = value if isinstance(value, bytes) else b""
-        white, largest = (_one_value(page.tags.valueof(code)) for code in (_WHITE_LEVEL, _MAX_SAMPLE_VALUE))
+        white, largest = (_one_value(page.tags.valueof(code)) for code in (50717, 281))  # WhiteLevel, MaxSampleValue
         has_exif = _EXIF in page.tags or ORIENTATION in page.tags
         place, order, big = page.offset, page.parent.byteorder, page.parent.is_bigtiff
 
@@ -325,8 +300,6 @@ def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
 
 
 UPRIGHT = 1  # orientation of images that are shown as they are stored
-_SAME = 0.1  # share within which two exposures are considered equal: shutters and ISO numbers are rounded
-_EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 
 
 class Exposure(NamedTuple):
@@ -350,9 +323,9 @@ def find_exposure(facts: ImageHeader) -> Exposure | None:
     """Return the exposure of an image; None if a part of it is missing or the file is damaged."""
     try:
         if facts.exif is None and facts.kind == "RAW":
-            numbers: tuple[Any, ...] = read_shot(facts.path)
+            numbers: tuple[Any, ...] = decoders.read_shot(facts.path)
         else:
-            numbers = tuple((facts.exif or {})[tag] for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
+            numbers = tuple((facts.exif or {})[tag] for tag in _EXPOSURE)
         # Some cameras give two ISO numbers.
         exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
     except Exception:  # damaged tags cause a dozen types of errors
@@ -365,7 +338,8 @@ def check_exposures(images: Sequence[ImageHeader]) -> None:
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
         first, expected = found[0]
-        if abs(exposure.relative / expected.relative - 1) > _SAME:
+        # Shutters and ISO numbers are rounded.
+        if abs(exposure.relative / expected.relative - 1) > 0.1:
             hint = "Expose all images alike, or give each image's exposure as the intensity of its light"
             problem = f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
             raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
@@ -386,9 +360,8 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
     mean = sum(exposure.relative for exposure in found) / len(found)
     darkest, brightest = (choose(found, key=lambda exposure: exposure.relative) for choose in (min, max))
     text = f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
-    tags = [facts.exif or {} for facts in images]
-    words = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
-    automatic = [word for word, tag in words.items() if any(of_image.get(tag) == 0 for of_image in tags)]
+    tags = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
+    automatic = [word for word, tag in tags.items() if any((facts.exif or {}).get(tag) == 0 for facts in images)]
     if automatic:
         text += f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
     return [exposure.relative / mean for exposure in found], text

@@ -25,32 +25,18 @@ from splinecli.system.files import check_file, is_folder, utf8_name
 if TYPE_CHECKING:
     import cv2
 
-FILM_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
-
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
-
-LEAST_DIFFERENCE = 0.05
-"""Distance between two frames' thumbnails of unit length below which their light is considered the same."""
-
 _CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
-_THUMBNAIL, _SMALL = 64, 512  # longest sides in pixels: of shading, of sharpness and exposure
-_NEIGHBOURS = 7  # frames before and after, whose light is similar
-_LEAST_READ = 0.8  # share of the frames that the film states
-_BLURRED = 0.6  # share of the neighbours' sharpness
-_DARK = 0.2  # share of the usual brightness
-_CLIPPED = 250  # stored value from which a pixel is overexposed
-_MOST_CLIPPED = 0.01  # share of pixels that are overexposed
 # FFmpeg recognises playlists by their content, and these name other files. So only containers of films are opened.
 _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
-
-
 # A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels.
 _Candidate = tuple[int, Float32Array, float, float]
 
 
 def is_film(path: Path) -> bool:
     """Return whether the path has the name of a film, and is not a folder."""
-    return path.suffix.lower() in FILM_SUFFIXES and path.stem.strip(".") != "" and not is_folder(path)
+    suffixes = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+    return path.suffix.lower() in suffixes and path.stem.strip(".") != "" and not is_folder(path)
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
@@ -61,22 +47,14 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
     # Sharpness depends on the light, so only neighbouring frames are compared.
-    near = (slice(max(0, place - _NEIGHBOURS), place + _NEIGHBOURS + 1) for place in range(len(sharpness)))
-    around = [np.median(sharpness[frames]) for frames in near]
-    usable = (
-        (sharpness >= _BLURRED * np.array(around))
-        & (light >= _DARK * np.median(light))
-        & (light > 0)
-        & (clipped <= max(_MOST_CLIPPED, float(np.median(clipped))))
-    )
+    around = [np.median(sharpness[max(0, place - 7) : place + 8]) for place in range(len(sharpness))]
+    bright = (light >= 0.2 * np.median(light)) & (light > 0)
+    usable = (sharpness >= 0.6 * np.array(around)) & bright & (clipped <= max(0.01, float(np.median(clipped))))
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
-        raise InputError(
-            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light,"
-            f" expected at least {FEWEST_FRAMES}",
-            path=film,
-            hint="Film from a tripod while the lamp moves all around the object, with focus and exposure locked",
-        )
+        problem = f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light, expected"
+        hint = "Film from a tripod while the lamp moves all around the object, with focus and exposure locked"
+        raise InputError(f"{problem} at least {FEWEST_FRAMES}", path=film, hint=hint)
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
@@ -111,7 +89,7 @@ def _candidates(film: Path) -> list[_Candidate]:
                 number += 1
         if not found:
             raise ValueError
-    if number < _LEAST_READ * stated:
+    if number < 0.8 * stated:
         problem = f"the film breaks off: {number} of {stated:.0f} frames can be read"
         raise InputError(problem, path=film, hint="Copy it again")
     return found
@@ -125,24 +103,27 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
         size = max(1, round(image.shape[1] * share)), max(1, round(image.shape[0] * share))
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) if share < 1 else image
 
-    small = reduced(picture, _SMALL)
+    small = reduced(picture, 512)
     gray = small.astype(np.float32).mean(axis=2)
     sharpness = float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean() / max(float(gray.mean()), 1e-3))
-    clipped = float((small.max(axis=2) >= _CLIPPED).mean())
-    stored = np.asarray(reduced(small, _THUMBNAIL) / 255, np.float32)
+    clipped = float((small.max(axis=2) >= 250).mean())
+    stored = np.asarray(reduced(small, 64) / 255, np.float32)
     linear = np.asarray(decode_transfer(stored, BT709).mean(axis=2), np.float32)
     return number, linear.ravel(), sharpness, clipped
 
 
 def _farthest(thumbnails: Float32Array) -> list[int]:
-    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is ignored."""
+    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is ignored.
+
+    Unit vectors closer than 0.05 are considered to have the same light.
+    """
     if not len(thumbnails):
         return []
     vectors = unit(thumbnails)
     distance = np.linalg.norm(vectors - vectors.mean(axis=0), axis=1)
     chosen = [int(distance.argmax())]
     distance = np.linalg.norm(vectors - vectors[chosen[0]], axis=1)
-    while len(chosen) < MOST_FRAMES and distance.max() >= LEAST_DIFFERENCE:
+    while len(chosen) < MOST_FRAMES and distance.max() >= 0.05:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
     return chosen

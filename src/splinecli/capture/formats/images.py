@@ -19,25 +19,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from splinecli.capture.formats.decoders import (
-    COPY_AGAIN,
-    DAMAGED,
-    damage_as_input_error,
-    decode_raw,
-    decode_tiff,
-    native_stderr,
-    page_of,
-)
-from splinecli.capture.formats.facts import (
-    PILLOW_KINDS,
-    PNG,
-    ImageHeader,
-    StoredSize,
-    facts_in,
-    open_image,
-    open_with_pillow,
-    pnm_header,
-)
+from splinecli.capture.formats import decoders, facts
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array
 from splinecli.system.files import StrPath
@@ -55,9 +37,8 @@ class ExpectedSize:
     def check(self, found: tuple[int, ...], path: Path) -> None:
         """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or width."""
         if found[:2] != self.shape[:2]:
-            raise InputError(
-                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}", path=path
-            )
+            problem = f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}"
+            raise InputError(problem, path=path)
 
 
 def check_stored_size(
@@ -69,7 +50,7 @@ def check_stored_size(
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        problem = f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
+        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
         raise InputError(problem, path=path, hint="If the size is right, use a smaller copy of the image")
     check_memory(n_bytes, takes, path)
 
@@ -90,7 +71,7 @@ def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = Non
     """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
-        problem = f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available"
+        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available"
         raise InputError(problem, path=path, hint=hint)
 
 
@@ -98,11 +79,7 @@ def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} x {shape[0]}"
 
 
-def _gigabytes(n_bytes: float) -> str:
-    return f"{n_bytes / 1e9:.1f} GB"
-
-
-def common_size(images: Sequence[ImageHeader]) -> StoredSize:
+def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
     """Return the size of the largest of some images.
 
     Raises InputError if one has another height or width than the first, is too large, or has an incomplete header.
@@ -122,8 +99,6 @@ _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 # Messages of libpng and libjpeg about pixels that they could not read.
 _DAMAGE = re.compile(r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE)
 
-_LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
-
 
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
@@ -142,11 +117,13 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
 
 def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[Array, Array | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
-    with damage_as_input_error(path, DAMAGED, COPY_AGAIN), open_image(path) as (file, kind):
-        size = facts_in(file, kind, path).size
+    damage = decoders.damage_as_input_error(path, decoders.DAMAGED, decoders.COPY_AGAIN)
+    with damage, facts.open_image(path) as (file, kind):
+        size = facts.facts_in(file, kind, path).size
         check_stored_size(*size, path, expected)
-        length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + _LONGEST_METADATA
-        if length > most:  # it is read as a whole
+        # It is read as a whole, with 64 MB for previews and colour profiles.
+        length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
+        if length > most:
             problem = f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size"
             raise InputError(problem, path=path)
         file.seek(0)
@@ -170,33 +147,33 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
 def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
     """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
     if kind == "RAW":
-        return decode_raw(file.read(), path)
+        return decoders.decode_raw(file.read(), path)
     if kind == "TIFF":
-        pixels = decode_tiff(file, path)
+        pixels = decoders.decode_tiff(file, path)
         if pixels is not None:
             return pixels
         file.seek(0)
-    if kind in PILLOW_KINDS:
-        with open_with_pillow(file, kind, path) as picture:
+    if kind in facts.PILLOW_KINDS:
+        with facts.open_with_pillow(file, kind, path) as picture:
             mode = {"1": "L", "L": "L", "LA": "LA", "RGBA": "RGBA"}.get(picture.mode, "RGB")
             return np.asarray(picture.convert(mode))
     data = file.read()
     if kind in ("PGM", "PPM"):
-        width, height, most, start = pnm_header(data) or (0, 0, 0, 0)
+        width, height, most, start = facts.pnm_header(data) or (0, 0, 0, 0)
         shape, dtype = (height, width, 1 if kind == "PGM" else 3), ">u2" if most > 255 else "u1"
         if len(data) < start + math.prod(shape) * np.dtype(dtype).itemsize:
-            raise InputError(f"the {kind} is truncated", path=path, hint=COPY_AGAIN)
+            raise InputError(f"the {kind} is truncated", path=path, hint=decoders.COPY_AGAIN)
         return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(dtype[-2:])
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)
-    return _decode_with_opencv(data, page_of(path)[1])
+    return _decode_with_opencv(data, decoders.page_of(path)[1])
 
 
 def _decode_with_opencv(data: bytes, page: int) -> Array:
     """Return a page's pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error for a damaged file."""
     import cv2
 
-    with native_stderr() as messages:
+    with decoders.native_stderr() as messages:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
             content, pixels = np.frombuffer(data, np.uint8), None
@@ -219,14 +196,10 @@ def _decode_with_opencv(data: bytes, page: int) -> Array:
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
-_MOST_SMALL_CHUNKS, _USUAL_CHUNK = 10_000, 1024
-"""A PNG has no more chunks than these, and one for each so many bytes. Writers make chunks of 8 kB and more."""
-
-
 def _check_png(data: bytes, path: Path) -> None:
     """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
-    position, view = len(PNG), memoryview(data)
-    for _ in range(_MOST_SMALL_CHUNKS + len(data) // _USUAL_CHUNK):
+    position, view = len(facts.PNG), memoryview(data)
+    for _ in range(10_000 + len(data) // 1024):  # writers make chunks of 8 kB and more
         if position + 12 > len(data):
             break
         length = int.from_bytes(data[position : position + 4], "big")
@@ -234,11 +207,11 @@ def _check_png(data: bytes, path: Path) -> None:
         if end > len(data):
             break
         if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint=COPY_AGAIN)
+            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint=decoders.COPY_AGAIN)
         if data[body : body + 4] == b"IEND":
             return
         position = end
-    raise InputError("the PNG is truncated", path=path, hint=COPY_AGAIN)
+    raise InputError("the PNG is truncated", path=path, hint=decoders.COPY_AGAIN)
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
@@ -257,7 +230,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
             if following is None:
                 break
             position = following.start()
-    raise InputError("the JPEG is truncated", path=path, hint=COPY_AGAIN)
+    raise InputError("the JPEG is truncated", path=path, hint=decoders.COPY_AGAIN)
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
@@ -296,10 +269,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
     So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the mask, because
-    colours mean nothing in such an image.
-
-    Raises:
-        InputError: the image cannot be read, or no pixel is above zero.
+    colours mean nothing in such an image. Raises InputError if the image cannot be read, or no pixel is above zero.
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path, expected)

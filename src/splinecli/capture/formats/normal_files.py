@@ -17,17 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from splinecli.capture.formats import images
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.images import (
-    ExpectedSize,
-    check_stored_size,
-    check_vectors,
-    cut_out,
-    decode_image,
-    decode_with_alpha,
-    read_mask,
-)
 from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array
@@ -35,15 +27,8 @@ from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_pict
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
-_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")  # of a depth
-_GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp")
-
-_CLEARLY_BETTER = 0.02  # share of the mask's pixels
-_LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
-_FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has unit length by chance
 _LARGEST = 1e100  # values of damaged files may have an infinite square
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
-_LONGEST_NUMBER = 32  # characters of a number in a text, with the separator after it
 
 
 class _Stored(NamedTuple):
@@ -59,26 +44,25 @@ def read_normal_map(
 ) -> Float32Array:
     """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a normal.
 
+    Raises InputError if the file cannot be read, contains no normal map, or is not of the mask's size.
+
     Args:
         path: any of the files above but text.
         mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
             something out, that is left out, too.
         convention: whether green is y up or y down in a picture.
-
-    Raises:
-        InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
     """
     path = Path(path)
     expected = None
     if mask is not None:
         # Both headers are compared before either file is decoded.
         shape = read_header(mask).size[0] if isinstance(mask, Path) else mask.shape
-        expected = ExpectedSize(shape, "the mask", "a normal map")
+        expected = images.ExpectedSize(shape, "the mask", "a normal map")
     stored = _read_vectors(path, expected)
     if isinstance(mask, Path):
-        mask = read_mask(mask, ExpectedSize(stored.values.shape, path.name, "a mask"))
+        mask = images.read_mask(mask, images.ExpectedSize(stored.values.shape, path.name, "a mask"))
     wanted = np.ones(stored.values.shape[:2], np.bool_) if mask is None else mask
-    opaque = cut_out(stored.alpha)
+    opaque = images.cut_out(stored.alpha)
     if opaque is not None:
         wanted = wanted & opaque
     normals = _to_normals(stored, wanted, path, check_floats=True)
@@ -91,32 +75,29 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
     Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text files are flipped
-    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest.
+    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest. Raises InputError
+    if the file cannot be read, has another size, or has no normal inside the mask.
 
     Args:
         path: any of the files above; pictures as PNG or TIFF.
         mask: (H, W), of the size of the images, True at the pixels whose normals are read.
-
-    Raises:
-        InputError: the file cannot be read, has another size, or has no normal inside the mask.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in _GROUND_TRUTH_SUFFIXES:
-        raise InputError(
-            f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or .bmp', path=path
-        )
+    if suffix not in (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp"):
+        problem = f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or .bmp'
+        raise InputError(problem, path=path)
     if suffix != ".txt":
-        stored = _read_vectors(path, ExpectedSize(mask.shape, "the images", "a ground truth"))
+        stored = _read_vectors(path, images.ExpectedSize(mask.shape, "the images", "a ground truth"))
         return _to_normals(stored, mask, path), False
     values = _read_text(path, *mask.shape)
     filled = (values != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
-    upside_down = bool(turned - as_stored > _CLEARLY_BETTER * np.count_nonzero(mask))
+    upside_down = bool(turned - as_stored > 0.02 * np.count_nonzero(mask))
     return _to_normals(_Stored(values[::-1] if upside_down else values, None, False), mask, path), upside_down
 
 
-def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
+def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
     """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError."""
     check_file(path, "a normal map")
     suffix, alpha = path.suffix.lower(), None
@@ -127,31 +108,27 @@ def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
         with damage_as_input_error(path, "the .npy file is damaged, or contains no array of numbers"):
             # A map of the file, which reads the header alone. It rejects a file that is shorter than its header states.
             array = np.lib.format.open_memmap(path, mode="r")
-            check_vectors(array.shape, path)
-            check_stored_size(array.shape, array.dtype.itemsize, path, expected)
+            images.check_vectors(array.shape, path)
+            images.check_stored_size(array.shape, array.dtype.itemsize, path, expected)
             values = np.array(array)
     else:
-        values, alpha = decode_with_alpha(path, expected)
-        check_vectors(values.shape, path)
+        values, alpha = images.decode_with_alpha(path, expected)
+        images.check_vectors(values.shape, path)
     return _Stored(values, alpha, values.dtype.kind == "u")
 
 
 def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
-    most = 3 * height * width * _LONGEST_NUMBER + MOST_TEXT
+    most = 3 * height * width * 32 + MOST_TEXT  # characters of a number, with the separator after it
     check_length(path, most, "a normal map")
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
     except (ValueError, OSError):
         # This reader is slower, but it reads commas and names the line of an error.
         rows = read_number_rows(path, most=most).as_array()
-    expected = (height * width, 3)
-    if rows.shape != expected:
-        raise InputError(
-            f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {expected[0]} rows of 3,"
-            f" one for each pixel of {height} x {width}",
-            path=path,
-        )
+    if rows.shape != (height * width, 3):
+        problem = f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {height * width} rows of 3,"
+        raise InputError(f"{problem} one for each pixel of {height} x {width}", path=path)
     return rows.reshape(height, width, 3)
 
 
@@ -189,17 +166,15 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
     if not usable.any():
         return
-    share = float((np.abs(length[usable] - 1) < _LENGTH_TOLERANCE).mean())
-    if share < _FEWEST_UNIT:
-        raise InputError(
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected nearly"
-            " all: these are no normals",
-            path=path,
-            hint="If the background is not black, give a mask",
-        )
+    # Unit vectors may have gone through 8 bits, resizing or JPEG. In photographs, a third has unit length by chance.
+    share = float((np.abs(length[usable] - 1) < 0.1).mean())
+    if share < 0.6:
+        problem = f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected"
+        hint = "If the background is not black, give a mask"
+        raise InputError(f"{problem} nearly all: these are not normals", path=path, hint=hint)
 
 
-def read_depth(path: Path, expected: ExpectedSize) -> Float64Array:
+def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
     """Return a depth map (H, W) float64, NaN where it is not finite because the depth is unknown.
 
     Raises:
@@ -211,9 +186,9 @@ def read_depth(path: Path, expected: ExpectedSize) -> Float64Array:
     with damage_as_input_error(path, "the depth map is damaged and cannot be read"):
         if suffix == ".npy":
             stored: Array = np.lib.format.open_memmap(path, mode="r")
-            check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
+            images.check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
         else:
-            stored = (_read_exr if suffix == ".exr" else decode_image)(path, expected)
+            stored = (_read_exr if suffix == ".exr" else images.decode_image)(path, expected)
     if stored.ndim == 3 and stored.shape[2] in (1, 3, 4):
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
@@ -225,7 +200,7 @@ def read_depth(path: Path, expected: ExpectedSize) -> Float64Array:
     return depth
 
 
-def _read_exr(path: Path, expected: ExpectedSize) -> Array:
+def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
     with path.open("rb") as file:
@@ -233,13 +208,13 @@ def _read_exr(path: Path, expected: ExpectedSize) -> Array:
         with native_stderr():
             low, high = library.File(name, header_only=True).header()["dataWindow"]
         shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
-        check_stored_size(shape, 4, path, expected)
+        images.check_stored_size(shape, 4, path, expected)
         # For damaged pixels, the library only prints a warning, and stdout is reserved for the product of a command.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path=path)
-    for name in (*_EXR_CHANNELS, *channels):
+    for name in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):  # names of a depth, then any other
         if name in channels:
             return np.asarray(channels[name].pixels)
     raise InputError("the EXR file has no channel", path=path)

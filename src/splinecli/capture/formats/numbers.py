@@ -27,8 +27,7 @@ from splinecli.system.files import check_file, is_substitution, reading
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
 _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
-_LINE_END = re.compile(r"\r\n|\r|\n")
-_BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
+
 _FROM_PIPES: dict[Path, bytes] = {}
 
 WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
@@ -84,11 +83,8 @@ def check_length(path: Path, most: int, expected: str = "a text file") -> None:
     check_file(path, expected)
     length = path.stat().st_size
     if length > most:
-        raise _too_long(f"{length / 1e6:.1f} MB", most, path)
-
-
-def _too_long(found: str, most: int, path: Path) -> InputError:
-    return InputError(f"found {found}, expected a text file of at most {most / 1e6:.1f} MB", path=path)
+        problem = f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB"
+        raise InputError(problem, path=path)
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
@@ -106,7 +102,8 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
             with path.open("rb") as pipe:
                 content = pipe.read(most + 1)
             if len(content) > most:
-                raise _too_long(f"more than {most / 1e6:.1f} MB", most, path)
+                size = f"{most / 1e6:.1f} MB"
+                raise InputError(f"found more than {size}, expected a text file of at most {size}", path=path)
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
 
@@ -130,9 +127,9 @@ def read_lines(
             hint = "Save it as plain UTF-8 text"
             raise InputError("the file is not UTF-8 text", path=path, hint=hint) from None
         text = content.decode("latin-1")
-    lines = _LINE_END.split(text)
-    if len(lines) > most // _BYTES_OF_LINE:
-        raise InputError(f"found {len(lines)} lines, expected at most {most // _BYTES_OF_LINE}", path=path)
+    lines = re.split(r"\r\n|\r|\n", text)
+    if len(lines) > most // 20:  # bytes of a line, on average: each line takes time and memory
+        raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path=path)
     return lines
 
 
@@ -204,18 +201,12 @@ def parse_number(word: str, path: Path, line: int) -> float:
     return value
 
 
-KEY = "Normal_gt"
-
 _TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 """Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them: a double may be stored
 as bytes."""
-_COMPLEX = 1 << 11  # a flag of an array
-_START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
-_MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
-_MOST_NUMBERS = 1 << 20  # of a matrix of a small file
 
 
 class _Variable(NamedTuple):
@@ -241,12 +232,12 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
     """
     with path.open("rb") as file:
         variables = list(_variables(file, path))
-        variable = next((v for v in variables if v.name == KEY), None)
+        variable = next((v for v in variables if v.name == "Normal_gt"), None)
         if variable is None:
             maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
             if len(maps) != 1:
-                found = ", ".join(maps) or "none"
-                raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
+                problem = f"found no Normal_gt, and of other H x W x 3 arrays {', '.join(maps) or 'none'}, expected one"
+                raise InputError(problem, path=path)
             (variable,) = maps.values()
         check_vectors(variable.shape, path)
         check_stored_size(variable.shape, 8, path, expected)
@@ -259,12 +250,12 @@ def read_matrices(path: Path) -> dict[str, Array]:
         return {
             v.name: _numbers(file, v)
             for v in list(_variables(file, path))
-            if len(v.shape) == 2 and 0 < math.prod(v.shape) <= _MOST_NUMBERS
+            if len(v.shape) == 2 and 0 < math.prod(v.shape) <= 1 << 20
         }
 
 
 def _numbers(file: BinaryIO, variable: _Variable) -> Array:
-    most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
+    most = 8 * math.prod(variable.shape) + (1 << 16)
     content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
     kind, numbers = next(islice(_parts(content, variable.order), 3, None))
     stored = np.frombuffer(numbers, variable.order + _NUMBERS[kind])
@@ -283,9 +274,10 @@ def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
         kind, length = struct.unpack(order + "II", tag)
         start, compressed = file.tell(), kind == _COMPRESSED
         if kind in (_COMPRESSED, _MATRIX):
-            parts = _parts(_read(file, start, length, _START_BYTES, compressed=compressed), order)
+            # 4096 bytes are enough for its sizes and its name.
+            parts = _parts(_read(file, start, length, 1 << 12, compressed=compressed), order)
             (flags, *_) = struct.unpack(order + "II", next(parts)[1])
-            if flags & 0xFF in _CLASSES and not flags & _COMPLEX:
+            if flags & 0xFF in _CLASSES and not flags & (1 << 11):  # of complex numbers
                 shape, name = next(parts)[1], next(parts)[1]
                 sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
                 dtype = _CLASSES[flags & 0xFF]

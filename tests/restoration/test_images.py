@@ -1,4 +1,4 @@
-"""White levels: found where cameras clip below the full scale of 16 bits, and not where something else looks flat."""
+"""White levels and saturated observations, against analytic images; and the object, found by its brightness."""
 
 import struct
 from pathlib import Path
@@ -10,10 +10,11 @@ import tifffile
 from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
-from splinecli.capture import open_capture
+from splinecli.capture.formats.images import decode_image, to_linear
+from splinecli.capture.reader import open_capture
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.restoration.images import Saturation, WhiteLevel, look_at
+from splinecli.restoration.images import Saturation, WhiteLevel, find_object, find_saturated, look_at, restore_saturated
 
 SIDE = 60
 LIGHTS = spiral_lights(12, 50)
@@ -216,3 +217,96 @@ def test_tiff_of_12_bits_a_sample(tmp_path: Path) -> None:
     assert capture.white_level.origin == "file"
     assert capture.restored is not None
     assert np.count_nonzero(capture.restored) <= np.count_nonzero(images == 4095)
+
+
+GRID_LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
+GRID_LIGHTS /= np.linalg.norm(GRID_LIGHTS, axis=1, keepdims=True)
+
+
+def matte(pixels: int) -> np.ndarray:
+    """Observations (pixels, 9) of matte surfaces that look to the camera, of every albedo."""
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(pixels, 3)) * (0.3, 0.3, 0.1) + (0, 0, 1)
+    normals *= rng.uniform(0.3, 1, (pixels, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.maximum(normals @ GRID_LIGHTS.T, 0)
+
+
+def clipped_at(level: float) -> tuple[np.ndarray, ...]:
+    """500 matte pixels: true, which of their observations are saturated, and all as stored and as restored."""
+    truth = matte(500)
+    stored = np.minimum(truth, level).astype(np.float32)
+    restored = stored.copy()
+    restore_saturated(restored, truth >= level, GRID_LIGHTS)
+    return truth, truth >= level, stored, restored
+
+
+def test_matte_pixels_come_back():
+    truth, saturated, stored, restored = clipped_at(0.6)
+    np.testing.assert_array_equal(restored[~saturated], stored[~saturated])
+    assert (restored >= stored).all()
+    known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
+    assert known.sum() > 50
+    # Stored, they are off by up to 0.4; a pixel's four others tell three unknowns.
+    np.testing.assert_allclose(restored[known], truth[known], atol=0.015)
+    assert np.abs(stored - truth)[known].max() > 0.2
+
+
+def test_fewer_than_three_others_still_bound_them():
+    truth, saturated, stored, restored = clipped_at(0.25)
+    few = ((~saturated).sum(axis=1) > 0) & ((~saturated).sum(axis=1) < 3)
+    assert few.sum() > 20
+    assert np.isfinite(restored).all()
+    assert np.abs(restored - truth)[few].mean() < 0.9 * np.abs(stored - truth)[few].mean()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        (np.array([[255, 3, 3], [254, 254, 254]], np.uint8), [True, False]),
+        (np.array([[65_535], [255]], np.uint16), [True, False]),
+        (np.array([[1.0], [1e9]], np.float32), [False, False]),
+    ],
+)
+def test_full_scale_is_saturated(pixels, expected):
+    assert find_saturated(pixels).tolist() == expected
+
+
+WIDTH = 120
+
+
+def disc(x: float, y: float, radius: float) -> np.ndarray:
+    rows, columns = np.mgrid[:WIDTH, :WIDTH]
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def test_the_largest_part_with_its_holes_filled():
+    rng = np.random.default_rng(0)
+    thing, crumb, pupil = disc(50, 60, 30), disc(105, 15, 8), disc(45, 55, 6)
+    brightness = np.where(thing, 0.4, 0.004) + np.where(crumb, 0.6, 0)
+    brightness[pupil] = 0.003  # black paint
+    brightness[10, 60] = 5.0  # a hot pixel
+    brightness *= rng.uniform(0.8, 1.2, brightness.shape)
+    found = find_object(brightness.astype(np.float32))
+    assert (found != thing).mean() < 0.005
+    assert found[pupil].all()
+    assert not found[crumb].any()
+
+
+@pytest.mark.parametrize(
+    ("brightness", "said"), [(np.zeros((WIDTH, WIDTH)), "are black"), (np.full((WIDTH, WIDTH), 0.5), "covers 100.0 %")]
+)
+def test_nothing_stands_out(brightness, said):
+    with pytest.raises(InputError, match=said):
+        find_object(brightness.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    "place", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse", "synth/L17/bowl_S"]
+)
+def test_real_objects(shared_data, place):
+    """Intersection over union with the masks that people drew."""
+    source = open_capture(shared_data / place)
+    images = [to_linear(decode_image(path), path).mean(axis=2) for path in source.files.images[::4]]
+    mask = source.read_mask(images[0].shape)
+    found = find_object(np.mean(images, axis=0))
+    assert (found & mask).sum() > 0.85 * (found | mask).sum()

@@ -1,0 +1,77 @@
+"""The seconds that `infer` is expected to take for each stage of a capture: for its progress bar, and for `info`.
+
+The costs were measured on two cores (benchmarks/large_captures.py), with and without native bfloat16.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from splinecli.methods.estimator import student_sizes
+from splinecli.system.machine import count_available_cores
+
+AUTOMATIC_FROM = 100_000
+"""Pixels from which a capture is distilled by default.
+
+For smaller captures, distillation would save little: a sample of 10,000 pixels takes the network almost as long as all
+the normals. From this size on, it takes less than half of the network's time on 1 to 16 cores and an H100."""
+
+
+class _Costs(NamedTuple):
+    """Seconds of one core. `learn` and `write` use one core only."""
+
+    read: float  # per pixel of each image
+    network: float  # network, student, refine_net, octave: per pixel
+    student: float
+    refine_net: float  # in four orientations
+    octave: float
+    learn: float  # per step
+    write: float  # per pixel
+
+
+_BFLOAT16 = _Costs(1.4e-7, 1.3e-4, 1.0e-6, 3.0e-5, 7e-7, 1.6e-3, 3e-7)
+_FLOAT32 = _Costs(1.4e-7, 2.4e-4, 1.7e-6, 5.5e-5, 8e-7, 2.0e-3, 3e-7)
+_OTHER_METHODS = 4e-5  # per pixel
+_UNLIKE = 0.005  # share of pixels that the network estimates beside a distilled estimator
+_INDIRECT = 0.3  # share of the pixels that are usually estimated again
+
+
+def expected_seconds(
+    n_pixels: int, n_images: int, image_pixels: int, *, network: bool = True, distils: bool | None = None
+) -> dict[str, float]:
+    """Return the expected seconds of each stage on this machine; see `Clock`.
+
+    Args:
+        n_pixels: number of pixels of the mask.
+        image_pixels: number of pixels of each image.
+        network: whether the method is spline-net, and not a fit.
+        distils: whether a distilled estimator is used. None decides by AUTOMATIC_FROM.
+    """
+    cores = min(count_available_cores(), 8)
+    costs = _BFLOAT16 if _has_bfloat16() else _FLOAT32
+    read = costs.read * image_pixels * n_images / min(cores, 2)
+    found = {"read": read, "check": 1.5, "write": costs.write * n_pixels}
+    if not network:
+        return {**found, "estimate": _OTHER_METHODS * n_pixels / cores}
+    if n_pixels >= AUTOMATIC_FROM if distils is None else distils:
+        size = student_sizes(n_pixels)[0]
+        learn = costs.network * size.sample / cores + costs.learn * size.steps
+        unlike = min(_UNLIKE * n_pixels, size.sample)
+        estimate = (costs.student * n_pixels + costs.network * unlike) / cores
+        found |= {"distil": learn, "estimate": estimate, "indirect_light": _INDIRECT * learn}
+    else:
+        estimate = costs.network * n_pixels / cores
+        found |= {"estimate": estimate, "indirect_light": _INDIRECT * estimate}
+    refined, octaves = n_pixels, 0.0
+    while refined > 150_000:  # MOST_PIXELS of refinement/refiner.py, which imports PyTorch
+        octaves += costs.octave * refined
+        refined //= 4
+    return {**found, "refine": (costs.refine_net * refined + octaves) / cores}
+
+
+def _has_bfloat16() -> bool:
+    """Return whether the processor has bfloat16; without PyTorch, whose import takes longer than all of `info`."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8")
+    except OSError:
+        return False
+    return "_bf16" in text or " bf16" in text
