@@ -226,7 +226,7 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -
     source = open_capture(folder)
     assert [path.name for path in source.files.images] == [f"schräg {number}.png" for number in NUMBERS[:4]]
     assert [warning.code for warning in source.warnings] == ["images_left_out"]
-    assert "names 4 of the 12 images; the others are left out" in str(source.warnings[0])
+    assert "names 4 of the 12 images; the others were left out" in str(source.warnings[0])
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     # Sums over the colours may round differently.
     expected = window.of(on_image(whole.mask, whole.observations))[part.mask]
     np.testing.assert_allclose(part.observations, expected, rtol=1e-6)
-    described = describe_capture(MEDALLION, InferOptions(crop=crop, scale=scale))
+    described = describe_capture(InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale))
     assert (described["n_pixels"], described["reads"]) == (part.n_pixels, window.in_words())
 
 
