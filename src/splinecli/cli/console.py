@@ -135,13 +135,16 @@ class Messages(Observer):
 
     def __init__(self, *, quiet: bool) -> None:
         self.quiet = quiet
+        self._warned = set[str | None]()
 
     def say(self, message: str) -> None:
         if not self.quiet:
             print(printable(message), file=sys.stderr)
 
-    def warn(self, message: str) -> None:
-        self.say(f"splinecli: warning: {message}")
+    def warn(self, message: str, *, once: str | None = None) -> None:
+        if once is None or once not in self._warned:
+            self.say(f"splinecli: warning: {message}")
+        self._warned.add(once)
 
     def error(self, message: str) -> None:
         print(f"splinecli: {printable(message)}", file=sys.stderr)  # even with `quiet`

@@ -212,6 +212,20 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     )
 
 
+def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
+    """Warn of fewer lights than eight."""
+    count = len(seen.names)
+    return [CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")] * (count < 8)
+
+
+def lights_near_axis(seen: CaptureSample) -> list[CaptureWarning]:
+    """Warn of lights that all shine from near the camera."""
+    if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 30:
+        return []
+    text = "All lights are within 30 degrees of the camera axis; lower lights give better normals."
+    return [CaptureWarning(codes.LIGHTS_NEAR_AXIS, text)]
+
+
 REPEATED = frozenset({codes.REPEATED_IMAGES})  # if the lights differ, these contradict all others
 # After these warnings, no check that relies on the lights is reliable.
 DOUBTED = REPEATED | {
@@ -239,6 +253,8 @@ CHECKS = [
     Check(odd_image, REPEATED | {codes.IMAGE_SCALE}),
     Check(lambda s: light_warnings(s.light_check, s.origin, s.frame, s.strict), REPEATED | READ_OTHERWISE),
     Check(missing_mask, needs_lights=False),
+    Check(few_lights, needs_lights=False),
+    Check(lights_near_axis),
     Check(crowded_lights),
     Check(lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
     Check(other_readings, DOUBTED | READ_OTHERWISE),

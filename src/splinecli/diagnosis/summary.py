@@ -31,7 +31,7 @@ class Sample:
 Part = tuple[slice, slice]  # rows and columns of the images
 # An image is dark if its 99 % quantile is below this share of the white level. A capture carries a warning with fewer
 # lights than these, or with all lights nearer than this angle to the camera axis.
-DARK, FEW_LIGHTS, NARROW_DEG = 0.05, 8, 30.0
+DARK = 0.05
 _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
 
 
@@ -139,12 +139,6 @@ class CaptureSummary:
         found += self.mask_warnings
         if dark and not self.mask_warnings:
             found.append(self._dark_images(dark))
-        if len(self.images) < FEW_LIGHTS:
-            text = f"There are {len(self.images)} lights; use {FEW_LIGHTS} or more, well spread."
-            found.append(CaptureWarning(codes.FEW_LIGHTS, text))
-        if self.axis_angles_deg.max() < NARROW_DEG:
-            text = f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis"
-            found.append(CaptureWarning(codes.LIGHTS_NEAR_AXIS, f"{text}; lower lights give better normals."))
         return found
 
     def _dark_images(self, dark: Sequence[ImageSummary]) -> CaptureWarning:

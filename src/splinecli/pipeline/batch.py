@@ -287,7 +287,7 @@ class _Warnings(Observer):
     def __init__(self) -> None:
         self.found: list[str] = []
 
-    def warn(self, message: str) -> None:
+    def warn(self, message: str, *, once: str | None = None) -> None:
         self.found.append(message)
 
 

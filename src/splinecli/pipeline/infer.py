@@ -21,7 +21,7 @@ from splinecli.capture.files import digest
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
-from splinecli.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.capture_warnings import EIGHT_BIT, NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
@@ -202,7 +202,8 @@ def infer_capture(
             clock=clock,
         )
         for warning in estimate.capture.warnings:
-            observer.warn(f"{capture.name}: {warning}")
+            once = warning.code if warning.kind is EIGHT_BIT else None  # usual in a batch, and of all its captures
+            observer.warn(f"{capture.name}: {warning}", once=once)
         loaded = None if estimator.weights is None else estimator.weights["sha256"]
         report = report_of(
             estimate,

@@ -74,8 +74,11 @@ class Observer:
     def say(self, message: str) -> None:
         """Receive a message for the user."""
 
-    def warn(self, message: str) -> None:
-        """Receive a warning: the results may be worse than they could be."""
+    def warn(self, message: str, *, once: str | None = None) -> None:
+        """Receive a warning: the results may be worse than they could be.
+
+        Of several warnings with the same word `once`, the first one is enough.
+        """
 
     def error(self, message: str) -> None:
         """Receive an error: one of several inputs cannot be used, and the work goes on without it."""
