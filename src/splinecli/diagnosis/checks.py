@@ -220,9 +220,9 @@ def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
 
 def lights_near_axis(seen: CaptureSample) -> list[CaptureWarning]:
     """Warn of lights that all shine from near the camera."""
-    if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 30:
+    if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 25:
         return []
-    text = "All lights are within 30 degrees of the camera axis; lower lights give better normals."
+    text = "All lights are within 25 degrees of the camera axis; lower lights give better normals."
     return [CaptureWarning(codes.LIGHTS_NEAR_AXIS, text)]
 
 
