@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenes import spiral_lights
+from scenes import spiral_lights, write_capture
 
 
 def test_the_report_of_a_capture(run, capture):
@@ -33,9 +33,19 @@ def test_the_same_as_json(document, capture):
     assert report["exposure"]["saturated"] == 0
     # 60000 of 65535 under the light from the camera, at the top of the sphere.
     assert report["exposure"]["bright"][1] == pytest.approx(60_000 / 65_535, abs=0.01)
-    assert report["warnings"] == [
-        "All lights are within 30 degrees of the camera axis; lower lights give better normals."
+    assert report["warnings"] == []
+
+
+def test_few_lights_near_the_axis(run, document, truth):
+    lights = spiral_lights(6, 20)
+    images = np.rint(np.moveaxis(truth @ lights.T, 2, 0).clip(0) * 60_000).astype(np.uint16)
+    write_capture(Path("near"), images, lights, mask=truth[..., 2] > 0.3)
+    warnings = [
+        "There are 6 lights; use 8 or more, well spread.",
+        "All lights are within 25 degrees of the camera axis; lower lights give better normals.",
     ]
+    assert document("info", "near")["warnings"] == warnings
+    assert [line.partition("near: ")[2] for line in run("infer", "near", "--method", "ls").err.splitlines()] == warnings
 
 
 def test_the_camera_of_exif(run, document):
