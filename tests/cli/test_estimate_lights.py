@@ -151,7 +151,7 @@ def test_a_film(run, document):
     assert run(*command, "--overwrite").code == 0 and first.read_bytes() == whole
     Path("out/frames/clip/mask.png").write_bytes(whole)
     result = run(*command, "--overwrite")
-    assert result.code == 5 and "contains mask.png, which is no frame" in result.err
+    assert result.code == 5 and "contains mask.png, which is not a frame" in result.err
     Path("out/frames/clip/mask.png").unlink()
     assert "from the camera axis" in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
 

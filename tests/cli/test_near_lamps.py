@@ -175,7 +175,7 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command:
     lamp = f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object, which is 64"
     assert lamp in refused.err
     assert "inside the object. Give all lengths in one unit, such as millimetres" in refused.err
-    for factor, words in ((0.3, "A lamp is very near"), (1000, "so far that they are distant")):
+    for factor, words in ((0.3, "A lamp is very near"), (1000, "so far away that their light is parallel")):
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
         for strict, code in ((("--strict",), 3), ((), 0)):
             warned = run(*arguments, *strict)
