@@ -53,7 +53,14 @@ def words(out: str, shell: str) -> list[str]:
 COMPLETED = {
     "splinecli in": ["infer", "info", "integrate"],
     "splinecli evaluate --me": ["--method"],
-    "splinecli info --l": ["--light-distance", "--light-frame", "--light-positions", "--lights", "--light-format"],
+    "splinecli info --l": [
+        "--light-distance",
+        "--light-frame",
+        "--light-positions",
+        "--lights",
+        "--light-format",
+        "--lights-in-channels",
+    ],
     "splinecli evaluate data --method ls": ["ls", "ls-trimmed"],
     "splinecli infer capture --device c": ["cpu", "cuda"],
     "splinecli infer capture --weights cnn": ["cnn-ps"],
