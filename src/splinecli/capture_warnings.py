@@ -107,6 +107,7 @@ EXIF_ORIENTATION = WarningKind(
     "Make mask and lights for the stored pixels",
 )
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
+GRAY_MATERIAL = WarningKind("gray_material", "With `--maps material`: gray images have no base colour, only brightness")
 GROUND_TRUTH_FRAME = WarningKind(
     "ground_truth_frame",
     "The ground truth fits the images only with x or y negated, or exchanged",

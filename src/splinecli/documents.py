@@ -88,6 +88,13 @@ class SurfaceFacts(Document):
     discontinuity: NotNegative
 
 
+class MaterialFacts(Document):
+    """The material: whether the images have no colour, and the mean confidence."""
+
+    gray: bool
+    mean_confidence: Share
+
+
 class EstimateReport(Document):
     """The part of a report of infer that describes the estimate."""
 
@@ -120,6 +127,7 @@ class EstimateReport(Document):
     white_level: WhiteLevel | None
     # standard deviation in pixels of the blur that was removed from the images
     removed_blur: float | None
+    material: MaterialFacts | None
     surface: SurfaceFacts | None
 
 
@@ -202,6 +210,25 @@ class SkippedCapture(Document):
     reason: str
 
 
+class Likeness(Document):
+    """How well pictures agree with photographs, over all pixels of the mask and all held-out lights."""
+
+    psnr_db: float  # peak signal-to-noise ratio, relative to white
+    error: NotNegative  # mean absolute difference, relative to the mean of the photographs
+
+
+class RelightingReport(Document):
+    """The likeness of pictures of a capture to photographs under the lights that a draw leaves out."""
+
+    capture: str
+    method: str
+    lights: list[Natural]
+    held_out: Count
+    material: Likeness
+    lambertian: Likeness
+    nearest: Likeness
+
+
 class Results(Document):
     """results.json, and the document of evaluate --json."""
 
@@ -214,6 +241,7 @@ class Results(Document):
     skipped: list[SkippedCapture]
     notes: list[str]
     version: str
+    relighting: list[RelightingReport] | UnsetType = UNSET
 
 
 class Failure(Document):
