@@ -135,7 +135,9 @@ def report(rows: Sequence[tuple[Floats, Floats]]) -> None:
     seen, confidence = table[:, 3] == 1, table[:, 4]
     parts = {"all": seen | True, "highlight observable": seen}
     parts |= {"confidence 0.7 and more": confidence >= 0.7, "confidence below 0.1": confidence < 0.1}
-    print("| pixels | share | roughness | metalness right | base, mean | base, median |\n|---|---:|---:|---:|---:|---:|")
+    print(
+        "| pixels | share | roughness | metalness right | base, mean | base, median |\n|---|---:|---:|---:|---:|---:|"
+    )
     for words, part in parts.items():
         roughness, metal, base = table[part, :3].T if part.any() else np.full((3, 1), np.nan)
         cells = (part.mean(), roughness.mean(), metal.mean(), base.mean(), np.median(base))

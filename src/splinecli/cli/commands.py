@@ -88,7 +88,8 @@ def evaluate(options: EvaluateOptions) -> int:
             _print_table(evaluation)
         for relit in outcome.document.get("relighting", ()):
             kinds = [f"{kind} {relit[kind]['psnr_db']:.1f} dB" for kind in ("material", "lambertian", "nearest")]
-            print(f"relighting {relit['capture']} from {len(relit['lights'])} lights, {relit['method']}: {', '.join(kinds)}")
+            lights = f"from {len(relit['lights'])} lights"
+            print(f"relighting {relit['capture']} {lights}, {relit['method']}: {', '.join(kinds)}")
     return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
 
 

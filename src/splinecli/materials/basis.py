@@ -145,12 +145,13 @@ class Sample(NamedTuple):
     geometry: Geometry
     seen: Tensor  # (P, F), 1 where the light reaches the pixel, else 0
     floor: Tensor  # (P,), the error that even a dark observation has
+    white: float  # pictures end at this value
 
     def take(self, chosen: Tensor) -> Sample:
         """Return some of the pixels."""
         cosines, z, shared, error = self.geometry
         own = Geometry(cosines[chosen], z[chosen], shared if shared.ndim == 1 else shared[chosen], error[chosen])
-        return Sample(self.observations[chosen], own, self.seen[chosen], self.floor[chosen])
+        return Sample(self.observations[chosen], own, self.seen[chosen], self.floor[chosen], self.white)
 
 
 def noise_floor(observations: Tensor, bright: float) -> Tensor:
@@ -204,13 +205,28 @@ def lobe_error(geometry: Geometry, roughness: float | Tensor) -> Tensor:
     return (geometry.normal_error / (2 * wide.clamp(min=0.01))).clamp(max=_MOST_LOBE_ERROR)[..., None]
 
 
-def fit_gloss(sample: Sample, gloss: Gloss, usual: float | None = None) -> tuple[Tensor, Tensor]:
-    """Return the costs (P,) and the bases (P,) of pixels of a gloss; see fit_base."""
-    diffuse = diffuse_lobe(sample.geometry, torch.full((1, 1), gloss.minnaert))
-    facets = facet_lobe(sample.geometry, torch.full((1, 1), gloss.roughness), torch.full((1, 1), gloss.tail))
+def fit_gloss(sample: Sample, gloss: Gloss) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the costs (P,) and the bases (P,) of pixels of a gloss, and their prediction errors (P, F); see fit_base.
+
+    The error of an observation is that of the prediction from the others.
+    """
+    one = torch.ones(1, 1)
+    diffuse = diffuse_lobe(sample.geometry, gloss.minnaert * one)
+    facets = facet_lobe(sample.geometry, gloss.roughness * one, gloss.tail * one)
     metallic, level = torch.tensor([float(gloss.is_metal)]), torch.tensor([gloss.level])
-    cost, base, _ = fit_base(sample, diffuse, facets, metallic, level, lobe_error(sample.geometry, gloss.roughness), usual)
-    return cost[:, 0], base[:, 0]
+    error = lobe_error(sample.geometry, gloss.roughness)
+    cost, base, weights = fit_base(sample, diffuse, facets, metallic, level, error)
+    slope, offset = (facets, 0 * facets) if gloss.is_metal else (diffuse, gloss.level * facets)
+    predicted = predict_left_out(sample, slope, offset, weights[:, 0])
+    return cost[:, 0], base[:, 0], (sample.observations.clamp(max=sample.white) - predicted) * sample.seen
+
+
+def predict_left_out(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
+    """Return what base * slope + offset, fitted to all observations (P, F) but one, predicts for this one."""
+    above, below = weights * slope * (sample.observations - offset), weights * slope**2
+    others = below.sum(1, keepdim=True) - below
+    base = ((above.sum(1, keepdim=True) - above) / others.clamp(min=1e-12)).clamp(min=0)
+    return (slope * base + offset).clamp(max=sample.white)
 
 
 class _Grid(NamedTuple):
@@ -238,32 +254,20 @@ def find_glosses(sample: Sample, bright: float) -> list[Gloss]:
     for place in order:
         own = owner == place
         gloss = _gloss(costs[own], grid, float(counts[place] / len(owner)))
-        found.append(gloss if gloss.is_metal else _with_likely_level(sample.take(own), gloss))
+        found.append(_most_predictive(sample.take(own), gloss))
     return found
 
 
-def _with_likely_level(sample: Sample, gloss: Gloss) -> Gloss:
-    """Return a gloss with the share of its level that leaves the smallest squares of a sample's observations.
+def _most_predictive(sample: Sample, gloss: Gloss) -> Gloss:
+    """Return a gloss with the share of its level, or none in place of a metal, that predicts observations best.
 
-    The costs tolerate a highlight that is in the wrong place. Where errors of the normals move highlights, a lower one
-    gives better pictures.
+    Each observation is predicted from the others. The costs tolerate a highlight in the wrong place, and a metal that
+    is fitted to a few observations in shadow. A lower level gives better pictures there.
     """
-    found = []
-    for share in _LEVEL_STEPS:
-        lower = replace(gloss, level=share * gloss.level)
-        _, base = fit_gloss(sample, lower)
-        wrong = (sample.observations - radiance(sample.geometry, lower, base)) * sample.seen
-        found.append((float(wrong.square().sum()), lower))
-    return min(found, key=lambda pair: pair[0])[1]
-
-
-def radiance(geometry: Geometry, gloss: Gloss, base: Tensor) -> Tensor:
-    """Return the radiance (P, F) of pixels of a gloss with these bases (P,)."""
-    diffuse = diffuse_lobe(geometry, torch.full((1, 1), gloss.minnaert))
-    facets = facet_lobe(geometry, torch.full((1, 1), gloss.roughness), torch.full((1, 1), gloss.tail))
+    choices = [replace(gloss, level=share * gloss.level) for share in ((1.0,) if gloss.is_metal else _LEVEL_STEPS)]
     if gloss.is_metal:
-        return base[:, None] * facets
-    return base[:, None] * diffuse + gloss.level * facets
+        choices.append(replace(gloss, metallic=0.0, roughness=0.5, roughness_error=0.26, tail=GGX))
+    return min(choices, key=lambda choice: float(fit_gloss(sample, choice)[2].square().sum()))
 
 
 def _fit_grid(sample: Sample, bright: float) -> tuple[Tensor, _Grid]:

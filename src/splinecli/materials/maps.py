@@ -25,6 +25,7 @@ from splinecli.materials.basis import (
     fit_gloss,
     lobe_error,
     noise_floor,
+    predict_left_out,
 )
 from splinecli.maths import Bools, Float32Array, Floats
 from splinecli.output_files import MAPS
@@ -41,6 +42,8 @@ _WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
 _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _USUAL_SPECULAR = 0.5  # of glTF, where there is no dielectric
 _UNKNOWN = 0.26  # standard deviation of a roughness of which nothing is known
+_FLAT = 0.1  # of the mean observation: an error of all observations in the last fit, so that dark ones do not decide
+_WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _STEP = 0.15  # of roughness
 _INFORMATION = 4.0  # squared standard deviations by which such a step changes a pixel, of confidence 0.5
@@ -109,14 +112,14 @@ def estimate_material(
     pixels = _Pixels(
         normals, _normal_error(normals, normal_confidence), lights_that_reach(normal_map, mask, lights), lighting_at
     )
-    bright, middle = pixels.brightness()
+    bright, middle, white = pixels.brightness()
     rng = np.random.default_rng(seed)
     glosses = find_glosses(pixels.take(pixels.choose(rng, middle), bright), bright)
     found = _Mixture(glosses, *_shares_of_glosses(mask, glosses, pixels, bright))
     columns = np.empty((len(normals), 6), np.float32)
     weights = np.empty(pixels.reached.shape, np.float32)
     for chosen in parts_of_pixels(len(normals)):
-        columns[chosen], weights[chosen] = found.fit(pixels.take(chosen, bright), chosen)
+        columns[chosen], weights[chosen] = found.fit(pixels.take(chosen, bright, white), chosen)
     gray, confidence, offset, matte, agreement, difference = columns.T
     trust = _smooth(agreement, mask) / np.maximum(_smooth(difference, mask), 1e-12 * bright**2)
     tint = None if colours is None else _tint(colours, weights, offset)
@@ -203,7 +206,7 @@ class _Pixels:
     reached: Bools  # (P, F)
     lighting_at: LightingAt
 
-    def take(self, chosen: PixelIndices, bright: float) -> Sample:
+    def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> Sample:
         """Return some of the pixels as the fits need them; `bright` is the albedo of bright pixels."""
         light: PixelLighting = self.lighting_at(chosen)
         observations = torch.from_numpy(np.asarray(light.observations, np.float32))
@@ -211,19 +214,20 @@ class _Pixels:
         directions = torch.from_numpy(np.asarray(light.directions, np.float32))
         geometry = Geometry.of(own, directions, torch.from_numpy(self.normal_error[chosen]))
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
-        return Sample(observations, geometry, reached.float(), noise_floor(observations, bright))
+        return Sample(observations, geometry, reached.float(), noise_floor(observations, bright), white)
 
-    def brightness(self) -> tuple[float, float]:
-        """Return the albedo of bright pixels, from the median over the lights, and the median mean observation."""
-        albedos, means = [], []
+    def brightness(self) -> tuple[float, float, float]:
+        """Return the albedo of bright pixels, the median mean observation, and the value of white in a picture."""
+        albedos, means, whites = [], [], []
         for chosen in parts_of_pixels(len(self.normals), step=max(1, len(self.normals) // 50_000)):
             sample = self.take(chosen, 0.0)
             cosines = sample.geometry.n_dot_l
             albedo = torch.where(cosines > 2 * _LIT, sample.observations / cosines.clamp(min=2 * _LIT), torch.nan)
             albedos.append(albedo.nanmedian(1).values.nan_to_num())
             means.append(sample.observations.mean(1))
+            whites.append(np.quantile(sample.observations.numpy(), _WHITE))
         bright = float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE))
-        return max(_ABOVE_BRIGHT * bright, 1e-12), float(torch.cat(means).median())
+        return max(_ABOVE_BRIGHT * bright, 1e-12), float(torch.cat(means).median()), float(np.mean(whites))
 
     def choose(self, rng: np.random.Generator, middle: float) -> PixelIndices:
         """Return random pixels that are not dark, or any if all are."""
@@ -265,7 +269,8 @@ class _Mixture:
         level = torch.from_numpy(self.level[chosen])[:, None]
         error = lobe_error(geometry, roughness)
         usual = float(np.median(self._usual[chosen]))
-        _, base, weights = fit_base(sample, diffuse, facets, metallic, level, error, usual)
+        fitted = sample._replace(floor=sample.floor + _FLAT * sample.observations.mean(1))
+        _, base, weights = fit_base(fitted, diffuse, facets, metallic, level, error, usual)
         slope, offset = torch.lerp(diffuse, facets, metallic), level * (1 - metallic) * facets
         # The information of a pixel on its roughness: by how much another one would change its observations.
         other = facet_lobe(
@@ -280,7 +285,7 @@ class _Mixture:
         information = (weight * (change - of_base * slope) ** 2).sum(1)
         known = mean([1 - min(1.0, gloss.roughness_error / _UNKNOWN) for gloss in glosses])[:, 0]
         sure = information / (information + _INFORMATION) * known * shares.amax(1)
-        compared = _compare(sample, slope, offset, weight)
+        compared = _compare(fitted, slope, offset, weight)
         weight = weight * slope / square
         pixels = torch.stack((base[:, 0], sure, (weight * offset).sum(1), *compared), dim=1)
         return pixels.numpy(), weight.numpy()
@@ -295,17 +300,10 @@ def _compare(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> 
     cosine = sample.geometry.n_dot_l.clamp(min=0)
     none = torch.zeros(1)
     _, base, matte_weights = fit_base(sample, cosine, 0 * cosine, none, none, torch.zeros(1, 1, 1))
-    matte = _left_out(sample.observations, cosine, matte_weights[:, 0])
-    found = offset + _left_out(sample.observations - offset, slope, weights)
-    difference = (found - matte) * sample.seen
-    return base[:, 0], (difference * (sample.observations - matte)).sum(1), difference.square().sum(1)
-
-
-def _left_out(observed: Tensor, slope: Tensor, weights: Tensor) -> Tensor:
-    """Return what a factor of `slope`, fitted to all observations (P, F) but one, predicts for this one."""
-    above, below = weights * slope * observed, weights * slope**2
-    others = below.sum(1, keepdim=True) - below
-    return slope * ((above.sum(1, keepdim=True) - above) / others.clamp(min=1e-12)).clamp(min=0)
+    matte = predict_left_out(sample, cosine, 0 * cosine, matte_weights[:, 0])
+    difference = (predict_left_out(sample, slope, offset, weights) - matte) * sample.seen
+    wrong = sample.observations.clamp(max=sample.white) - matte
+    return base[:, 0], (difference * wrong).sum(1), difference.square().sum(1)
 
 
 def _shares_of_glosses(
@@ -317,7 +315,7 @@ def _shares_of_glosses(
     for chosen in parts_of_pixels(len(costs)):
         sample = pixels.take(chosen, bright)
         for place, gloss in enumerate(glosses):
-            cost, base = fit_gloss(sample, gloss)
+            cost, base, _ = fit_gloss(sample, gloss)
             costs[chosen, place], bases[chosen, place] = cost.numpy(), base.numpy()
     costs -= costs.min(axis=1, keepdims=True)
     owner = costs.argmin(axis=1)

@@ -30,7 +30,7 @@ from splinecli.system.publishing import held_folder
 
 
 class EvaluateOutcome(NamedTuple):
-    """One evaluation for each protocol, the content of results.json, warnings, and why captures were not drawn or relit."""
+    """One evaluation for each protocol, the content of results.json, warnings, and what could not be drawn or relit."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]

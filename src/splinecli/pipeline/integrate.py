@@ -215,7 +215,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H, W)."""
     image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
-    return np.rint(255 * image.clip(0, 1)).astype(np.uint8)
+    return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:

@@ -59,7 +59,7 @@ def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
 
 def share_picture(values: Float32Array, _: Bools) -> Picture:
     """Return values (H, W, 1) as a gray picture (H, W): 0 is black, 1 and more is white."""
-    return np.rint(255 * values[..., 0].clip(0, 1)).astype(np.uint8)
+    return np.asarray(np.rint(255 * values[..., 0].clip(0, 1)), np.uint8)
 
 
 def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
@@ -72,4 +72,4 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
 
     Red is for occlusion in glTF; it is white in the mask.
     """
-    return np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)).astype(np.uint8)
+    return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
