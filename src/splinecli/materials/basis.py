@@ -116,7 +116,6 @@ _PRIOR_OF_SAMPLE = 0.3  # of the prior of a gloss, that each pixel counts
 _LEAST_GAIN = 0.3  # of the mean cost, for a further gloss
 _LEAST_SHARE = 0.02  # of the sample, for a gloss
 _INDEPENDENT = 30.0  # pixels: more tell no more about a gloss, because they deviate from it alike
-_SPREAD_OF_BASE = 1.0  # of the bases of one gloss, relative to their median; decides where a pixel shows no base
 _LEVEL_STEPS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of a level that are compared
 _STEPS = 4  # of the robust fit of a base
 
@@ -180,7 +179,9 @@ def fit_base(
     seen, floor, observed = sample.seen[:, None], sample.floor[:, None, None], sample.observations[:, None]
     slope = (1 - metallic) * diffuse[:, None] + metallic * facets[:, None]
     offset = level * (1 - metallic) * facets[:, None]
-    pull = 0.0 if usual is None else 1 / (_SPREAD_OF_BASE * usual + 1e-9) ** 2
+    pull: float | Tensor = 0.0
+    if usual is not None:  # bright pixels differ from it by more
+        pull = 1 / (usual + observed.mean(-1, keepdim=True) + 1e-9) ** 2
     weights = (seen / (2 * _RELATIVE * observed + floor) ** 2).expand_as(slope)
     for _ in range(_STEPS):
         above = (weights * slope * (observed - offset)).sum(-1, keepdim=True) + pull * (usual or 0.0)

@@ -66,6 +66,7 @@ class MaterialMaps:
     matte: (P,), the reflectance of a matte surface that fits best, in the unit of the observations.
     trust: (P,), the share of the material in pictures; the rest is matte. It is chosen by how well each predicts
         observations that are left out.
+    white: the brightest observation of pictures.
     exposure: the observation of a matte white surface that faces the light.
     """
 
@@ -78,6 +79,7 @@ class MaterialMaps:
     tail: Float32Array
     matte: Float32Array
     trust: Float32Array
+    white: float
     exposure: float
     is_gray: bool
 
@@ -138,6 +140,7 @@ def estimate_material(
         tail=found.mean("tail"),
         matte=matte.copy(),
         trust=trust.clip(0, 1),
+        white=white,
         exposure=exposure,
         is_gray=is_gray,
     )
@@ -170,7 +173,8 @@ def render_gray(
         radiance = base * torch.lerp(diffuse_lobe(geometry, column(found.minnaert)), facets, metalness)
         radiance = radiance + F0_OF_SPECULAR * column(found.specular) * (1 - metalness) * facets
         matte = column(found.matte) * geometry.n_dot_l.clamp(min=0)
-        images[chosen] = torch.lerp(matte, found.exposure * radiance, column(found.trust)).numpy() * reached[chosen]
+        shiny = (found.exposure * radiance).clamp(max=found.white)
+        images[chosen] = torch.lerp(matte, shiny, column(found.trust)).numpy() * reached[chosen]
     return images
 
 
