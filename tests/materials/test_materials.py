@@ -10,18 +10,21 @@ import pytest
 
 from glb_file import read_glb
 from scenes import cap_directions, sphere, write_capture
+from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
 from splinecli.evaluation.relighting import likeness
 from splinecli.inference import estimate_normals
 from splinecli.lights.lighting import PixelLighting
-from splinecli.materials.maps import MaterialMaps, estimate_material, render_gray
+from splinecli.materials import maps
+from splinecli.materials.maps import MaterialMaps, render_gray
 from splinecli.methods import make_estimator
 from splinecli.output_files import MAPS
 from splinecli.pipeline.evaluate import evaluate_captures
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.options import EvaluateOptions
+from splinecli.pipeline.integrate import integrate_normal_map
+from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
 from splinecli.results.maps import make_map, map_files
 from splinecli.results.material import material_facts
 
@@ -48,7 +51,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
 
 
 def material(observations, lights=LIGHTS, colours=None) -> MaterialMaps:
-    return estimate_material(
+    return maps.estimate_material(
         MASK,
         NORMALS,
         lights,
@@ -206,7 +209,7 @@ def test_a_rendered_scene(tmp_path):
     wrong = []
     for name in ("specular", "metallic"):
         observations = rendered.observations[name]
-        found = estimate_material(
+        found = maps.estimate_material(
             rendered.mask,
             rendered.normals,
             scene.lights,
@@ -244,3 +247,26 @@ def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
     )
     outcome = evaluate_captures(options)
     assert outcome.figure_problems == ["ball: no light is held out. Use fewer --n-lights."]
+
+
+def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
+    """The gains of a camera's channels are not known, so they tint the base colour."""
+    estimate = estimate_normals(open_capture(glossy).read(), make_estimator("ls"))
+    images = np.zeros((len(LIGHTS), SIZE, SIZE, 3), np.float32)
+    images[:, MASK] = estimate.capture.observations.T[..., None]
+    gains = np.array((1.5, 1, 0.5), np.float32)
+    white, tinted = estimate_material(estimate, images), estimate_material(estimate, images * gains)
+    assert white.is_gray
+    assert not tinted.is_gray
+    np.testing.assert_array_equal(tinted.roughness, white.roughness)
+    np.testing.assert_array_equal(tinted.metalness, white.metalness)
+    ratio = np.median(tinted.base_colour / white.base_colour, axis=0)
+    np.testing.assert_allclose(ratio / ratio[1], gains, atol=0.1)  # white highlights are assumed to be white
+
+
+def test_integrate_keeps_the_material(glossy, tmp_path):
+    infer_capture(glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out")))
+    integrate_normal_map(IntegrateOptions(normals=tmp_path / "out/ball"))
+    _, arrays = read_glb((tmp_path / "out/ball/mesh.glb").read_bytes())
+    stored = cv2.imread(str(tmp_path / "out/ball/metallic_roughness.png"))[..., ::-1]
+    np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
