@@ -60,6 +60,7 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     textures = {
         "colour": material["pbrMetallicRoughness"].get("baseColorTexture"),
         "normal": material.get("normalTexture"),
+        "gloss": material["pbrMetallicRoughness"].get("metallicRoughnessTexture"),
     }
     for name, reference in textures.items():
         if reference is not None:

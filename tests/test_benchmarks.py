@@ -210,3 +210,11 @@ def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
     for layer in (1, 2):
         value = np.maximum(value @ arrays[f"W{layer}"][material] + arrays[f"b{layer}"][material], 0)
     return float(np.maximum(np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1, 0).mean())
+
+
+@pytest.mark.usefixtures("coarse_shapes")
+def test_materials(run: Run) -> None:
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    printed = run("materials", "--scenes", "1", "--size", "16", "--sets", "metallic").splitlines()
+    assert "material" in printed[0]
+    assert [line.split("|")[1].strip() for line in printed[3:5]] == ["all", "highlight observable"]

@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 
     from splinecli.capture.record import LightFinder
     from splinecli.inference import NormalEstimate
+    from splinecli.materials.maps import MaterialMaps
 
 __version__ = "0.3.0"
-__all__ = ["__version__", "estimate_normals", "integrate_normals"]
+
+__all__ = ["__version__", "estimate_material", "estimate_normals", "integrate_normals"]
 
 # Everything else is imported inside the functions, because PyTorch takes a second or more to load.
 
@@ -136,6 +138,37 @@ def estimate_normals(
         if warning.is_error:
             warn(str(warning), stacklevel=2)
     return estimate
+
+
+def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None) -> MaterialMaps:
+    """Estimate base colour, roughness, metalness and specular reflection, as `infer --maps material` does.
+
+    Args:
+        estimate: the result of estimate_normals.
+        colours: (F, H, W, 3) linear RGB, the images divided by the light intensities. None gives a gray base colour.
+
+    Returns:
+        A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and roughness, metalness,
+        specular and confidence (P,).
+
+    Raises:
+        splinecli.errors.InputError: there are fewer than four lights.
+    """
+    import numpy as np
+
+    from splinecli.results.material import material_of
+
+    capture = estimate.capture
+    if colours is None:
+        return material_of(estimate)
+    images = (np.asarray(image, np.float32)[capture.mask] for image in np.asarray(colours))
+    means = capture.observations.T
+    # The observations may have another scale, and restored values.
+    scaled = (
+        image * (mean / np.maximum(image.mean(axis=1), 1e-12))[:, None]
+        for image, mean in zip(images, means, strict=True)
+    )
+    return material_of(estimate, scaled)
 
 
 def integrate_normals(

@@ -84,6 +84,7 @@ EXIF_ORIENTATION = WarningKind("exif_orientation",
     "An EXIF tag turns the images in viewers; splinecli uses the stored pixels",
     "Make mask and lights for the stored pixels")
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
+GRAY_MATERIAL = WarningKind("gray_material", "With `--maps material`: gray images have no base colour, only brightness")
 GROUND_TRUTH_FRAME = WarningKind("ground_truth_frame",
     "The ground truth fits the images only with x or y negated, or exchanged",
     "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`", severity="error")

@@ -97,6 +97,13 @@ class AlignmentReport(Document):
     moved_pixels: list[NotNegative]
 
 
+class MaterialFacts(Document):
+    """The material: whether the images have no colour, and the mean confidence."""
+
+    gray: bool
+    mean_confidence: Share
+
+
 class EstimateReport(Document):
     """The part of a report of infer that describes the estimate."""
 
@@ -130,6 +137,7 @@ class EstimateReport(Document):
     # standard deviation in pixels of the blur that was removed from the images
     removed_blur: float | None
     alignment: AlignmentReport | None
+    material: MaterialFacts | None
     surface: SurfaceFacts | None
 
 
@@ -221,6 +229,25 @@ class SkippedCapture(Document):
     reason: str
 
 
+class Likeness(Document):
+    """How well pictures agree with photographs, over all pixels of the mask and all held-out lights."""
+
+    psnr_db: float  # peak signal-to-noise ratio, relative to white
+    error: NotNegative  # mean absolute difference, relative to the mean of the photographs
+
+
+class RelightingReport(Document):
+    """The likeness of pictures of a capture to photographs under the lights that a draw leaves out."""
+
+    capture: str
+    method: str
+    lights: list[Natural]
+    held_out: Count
+    material: Likeness
+    lambertian: Likeness
+    nearest: Likeness
+
+
 class Results(Document):
     """results.json, and the document of evaluate --json."""
 
@@ -233,6 +260,7 @@ class Results(Document):
     skipped: list[SkippedCapture]
     notes: list[str]
     version: str
+    relighting: list[RelightingReport] | UnsetType = UNSET
 
 
 class Failure(Document):

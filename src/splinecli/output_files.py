@@ -5,7 +5,9 @@ pictures are not read as photographs. Functions are given by name, because their
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from splinecli.errors import InputError
 from splinecli.surface.surface_files import LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 
 # The file of the normal map in each format
@@ -13,7 +15,7 @@ NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy
            "exr": "normals.exr"}  # fmt: skip
 """The file of the normal map in each format."""
 
-ERROR_MAP = "error_map.png"
+ERROR_MAP, GLOSS = "error_map.png", "metallic_roughness.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 # With the lights estimated by `infer`. If results and capture share a folder, they may be the user's own.
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
@@ -37,6 +39,8 @@ class OutputMap:
     caption: below the picture on the page, which shows this map even if --maps does not name it; "" leaves it out.
     needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
     bytes_per_pixel, bytes_per_observation: memory. Maps that need any are computed before the others are written.
+    fewest_lights: number of lights below which the map is refused.
+    parts: if the map is written as several maps, their names, channels and pictures in place of the above.
     """
 
     name: str
@@ -52,11 +56,43 @@ class OutputMap:
     reads_images: bool = False
     bytes_per_pixel: int = 0
     bytes_per_observation: int = 0
+    fewest_lights: int = 0
+    parts: "tuple[MapPart, ...]" = ()
 
     @property
     def files(self) -> dict[str, str]:
-        """The names of the map's files, by suffix."""
+        """The names of the map's files, by suffix; those of parts, by their names."""
+        if self.parts:
+            return {name: name for part in self.parts for name in part.files}
         return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
+
+    def check_lights(self, count: int, path: Path | None = None) -> None:
+        """Raise InputError, about a capture in `path`, if there are too few lights for the map."""
+        if count < self.fewest_lights:
+            raise InputError(
+                f"{count} lights do not determine the {self.name}, expected at least {self.fewest_lights}",
+                path=path,
+                hint=f"Use more lights, or leave {self.name} out of --maps",
+            )
+
+
+@dataclass(frozen=True)
+class MapPart:
+    """A map that consists of some channels of another one, (H, W) if there is only one, and is written with it.
+
+    picture: "module:function" from values (H, W, C) and mask to an 8-bit picture.
+    """
+
+    name: str
+    first: int  # channel
+    last: int
+    picture: str = "splinecli.results.material:share_picture"
+    has_values: bool = True
+
+    @property
+    def files(self) -> list[str]:
+        """The names of the part's files."""
+        return [f"{self.name}.npy"] * self.has_values + [f"{self.name}.png"]
 
 
 # fmt: off
@@ -89,6 +125,25 @@ _ROWS = (
         " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
         unit="heights in pixels", scale=RELIEF_SCALE,
         scale_text="height, black -{scale}, gray 0, white {scale} pixels", bytes_per_pixel=BYTES_OF_SURFACE),
+    OutputMap(
+        name="material",
+        make="splinecli.results.material:material",
+        content="base colour, roughness, metalness, specular reflection and their confidence; float32,"
+        " zero outside the mask. The pictures have 8 bits: base colour in sRGB, and glTF's texture with roughness in"
+        " green and metalness in blue",
+        reads_images=True,
+        bytes_per_pixel=170,  # the maps, and the shares of up to six glosses
+        bytes_per_observation=5,
+        fewest_lights=4,
+        parts=(
+            MapPart("base_colour", 0, 3, "splinecli.results.material:base_colour_picture"),
+            MapPart("roughness", 3, 4),
+            MapPart("metalness", 4, 5),
+            MapPart("specular", 5, 6),
+            MapPart("material_confidence", 6, 7),
+            MapPart(GLOSS.removesuffix(".png"), 3, 5, "splinecli.results.material:gloss_picture", has_values=False),
+        ),
+    ),
 )
 # fmt: on
 MAPS = {row.name: row for row in _ROWS}

@@ -76,7 +76,7 @@ def evaluate(options: EvaluateOptions) -> int:
     for entry in outcome.document["skipped"]:
         talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:
-        talk.error(f"no figure: {problem}")
+        talk.error(f"no figure or relighting: {problem}")
     for warning in outcome.warnings:
         talk.warn(warning)
     for note in outcome.document["notes"]:
@@ -86,6 +86,10 @@ def evaluate(options: EvaluateOptions) -> int:
     elif not options.quiet:
         for evaluation in outcome.evaluations:
             _print_table(evaluation)
+        for relit in outcome.document.get("relighting", ()):
+            kinds = [f"{kind} {relit[kind]['psnr_db']:.1f} dB" for kind in ("material", "lambertian", "nearest")]
+            lights = f"from {len(relit['lights'])} lights"
+            print(f"relighting {relit['capture']} {lights}, {relit['method']}: {', '.join(kinds)}")
     return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
 
 

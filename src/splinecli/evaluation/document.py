@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
-from splinecli.documents import ComparisonReport, ProtocolReport
+from splinecli.documents import ComparisonReport, ProtocolReport, RelightingReport
 from splinecli.errors import printable
 from splinecli.evaluation import protocol as protocol_module
 from splinecli.evaluation import tables
@@ -206,13 +206,18 @@ def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes
 
 
 def write_results(
-    output: Path, evaluations: Sequence[Evaluation], figures: Sequence[CaptureFigure] | None
+    output: Path,
+    evaluations: Sequence[Evaluation],
+    figures: Sequence[CaptureFigure] | None,
+    relit: Sequence[RelightingReport] | None = None,
 ) -> dict[str, Any]:
     """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the folder.
 
     If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of results.json.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
+    if relit is not None:
+        document["relighting"] = [each.as_dict() for each in relit]
     shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
     texts = {
         "results.csv": results_csv(evaluations),

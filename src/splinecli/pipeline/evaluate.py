@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splinecli.capture import find_captures, open_capture
+from splinecli.documents import RelightingReport
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.document import TRIALS, write_results
 from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems
 from splinecli.evaluation.protocol import Evaluation, Protocol
+from splinecli.evaluation.relighting import relight_first_draw
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
 from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
 from splinecli.methods import Estimator, MethodOptions, make_estimator
@@ -28,7 +30,7 @@ from splinecli.system.publishing import held_folder
 
 
 class EvaluateOutcome(NamedTuple):
-    """One evaluation for each protocol, the content of results.json, warnings, and why figures could not be drawn."""
+    """One evaluation for each protocol, the content of results.json, warnings, and what could not be drawn or relit."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -69,7 +71,11 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
         problems: list[str] = []
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-        document = write_results(output, evaluations, figures)
+        relit: list[RelightingReport] | None = None
+        if options.relight:
+            relit, failed = _relight(captures, estimators, evaluations[0], observer)
+            problems += failed
+        document = write_results(output, evaluations, figures, relit)
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     untrained = [warning for estimator in estimators for k in counts for warning in estimator.warn_of_lights(k)]
     return EvaluateOutcome(evaluations, document, untrained, problems)
@@ -104,6 +110,24 @@ def _draw_figures(
             except (InputError, UsageError) as error:
                 problems.append(str(error))
     return figures, problems
+
+
+def _relight(
+    captures: Sequence[Path], estimators: Sequence[Estimator], evaluation: Evaluation, observer: Observer
+) -> tuple[list[RelightingReport], list[str]]:
+    """Return the relighting of each scored capture by each method, and why others could not be relit."""
+    folders = {name: folder for folder, name in distinct_names(captures).items()}
+    tasks = [(name, estimator) for name in folders if name in evaluation.captures for estimator in estimators]
+    found: list[RelightingReport] = []
+    problems: list[str] = []
+    with observer.progress("relighting", len(tasks)) as advance:
+        for name, estimator in tasks:
+            try:
+                found.append(relight_first_draw(folders[name], name, estimator, evaluation.protocol))
+            except (InputError, UsageError) as error:
+                problems.append(str(error))
+            advance(1)
+    return found, problems
 
 
 def _score_on_workers(

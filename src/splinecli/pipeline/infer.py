@@ -21,7 +21,14 @@ from splinecli.capture.files import digest
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
-from splinecli.capture_warnings import EIGHT_BIT, NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.capture_warnings import (
+    EIGHT_BIT,
+    GRAY_MATERIAL,
+    NOT_DISTILLED,
+    ROUGH_LIGHTS,
+    UNTRAINED_LIGHTS,
+    CaptureWarning,
+)
 from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
@@ -38,6 +45,7 @@ from splinecli.pipeline.integrate import make_surface, view_of_report
 from splinecli.results import files
 from splinecli.results.files import report_of
 from splinecli.results.maps import chosen_maps, make_map, map_files, map_picture
+from splinecli.results.material import base_colour_picture, gloss_picture, material_facts
 from splinecli.results.pages import result_page
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
@@ -216,7 +224,7 @@ def infer_capture(
         )
         if source.light_numbers is not None:
             report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
-        found = _make_files(source, estimate, report, options, clock)
+        found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write", note="writing")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
 
@@ -286,7 +294,10 @@ def align(
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
     """Raise InputError, before hours of work, if the results exceed the free memory or the mesh would be empty."""
-    costly = [row.name for row in chosen_maps(options.maps, page=options.html) if row.bytes_per_pixel]
+    rows = chosen_maps(options.maps, page=options.html)
+    for row in rows:
+        row.check_lights(capture.n_lights, folder)
+    costly = [row.name for row in rows if row.bytes_per_pixel]
     avoidable = [f"--maps {name}" for name in costly if name in options.maps]
     avoidable += ["--html"] * options.html + ["--surface"] * options.surface
     hint = "Mask the object, or use --scale or --crop"
@@ -311,6 +322,7 @@ def _make_files(
     estimate: NormalEstimate,
     report: dict[str, Any],
     options: InferOptions,
+    observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
     """Compute the results that the options request, add the surface to the report, and return the files."""
@@ -327,6 +339,15 @@ def _make_files(
             values = make_map(row, source, estimate)
         if values is not None:
             made[row.name] = values
+    gloss = None
+    if "material" in made:
+        facts = material_facts(made["material"], capture.mask)
+        report["material"] = facts.as_dict()
+        gloss = gloss_picture(made["material"][..., 3:5], capture.mask)
+        if facts.gray:
+            warning = CaptureWarning(GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone.")
+            report["warnings"].append({"code": warning.code, "text": warning.text})
+            observer.warn(f"{capture.name}: {warning}")
     scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
 
     def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
@@ -349,11 +370,14 @@ def _make_files(
         advance = clock.begin("surface", note="integrating")
         camera_matrix, pixel_size = view_of_report(report)
         colours = map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
+        if gloss is not None:  # highlights are not part of the base colour
+            colours = base_colour_picture(made["material"][..., :3], capture.mask)
         surface, report["surface"] = make_surface(
             estimate.normal_map,
             capture.mask,
             camera_matrix,
             colours,
+            gloss,
             discontinuity=options.discontinuity,
             pixel_size_mm=pixel_size,
             progress=advance,

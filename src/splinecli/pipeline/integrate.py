@@ -21,7 +21,7 @@ from splinecli.documents import SurfaceFacts, Unit
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.maths.normals import Convention, encode_picture
 from splinecli.maths.normals import unit as unit_vectors
-from splinecli.output_files import BYTES_OF_SURFACE, MAPS, NORMALS, REPORT
+from splinecli.output_files import BYTES_OF_SURFACE, GLOSS, MAPS, NORMALS, REPORT
 from splinecli.pictures.maps import encode_png
 from splinecli.pipeline.infer_options import check_pixel_size
 from splinecli.pipeline.options import IntegrateOptions
@@ -30,7 +30,7 @@ from splinecli.surface import surface_files
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
-from splinecli.surface.mesh import decimated_mesh, surface_mesh
+from splinecli.surface.mesh import decimated_mesh, fill_outside, surface_mesh
 from splinecli.surface.pixel_grid import focal_length, ray_basis
 from splinecli.surface.surface_files import (
     LEVEL_MAP,
@@ -52,6 +52,7 @@ def make_surface(
     mask: NDArray[np.bool_],
     camera_matrix: NDArray[np.floating] | None = None,
     colours: NDArray[np.uint8] | None = None,
+    gloss: NDArray[np.uint8] | None = None,
     *,
     discontinuity: float = DISCONTINUITY,
     largest_step: float | None = None,
@@ -65,7 +66,8 @@ def make_surface(
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and its entry in the reports.
 
-    The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. Without
+    The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. `gloss` (H, W, 3)
+    is glTF's texture of roughness and metalness; with None, the mesh is matte. Without
     `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on the object and gives a
     surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean depth. The prior is in
     the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is not needed. `level` is
@@ -98,6 +100,8 @@ def make_surface(
         mesh = decimated_mesh(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
     if pixel_aspect != 1:
         mesh = replace(mesh, vertices=mesh.vertices * np.array((1, pixel_aspect, 1), np.float32))
+    if gloss is not None:
+        mesh = replace(mesh, gloss=fill_outside(gloss, mask))
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit: Unit = "pixel" if camera_matrix is None else "mean depth"
     millimetres = 1 / pixel
@@ -189,19 +193,21 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     prior = None
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
-    picture, colours = options.colours, None
-    of_folder = options.normals / MAPS["albedo"].files["png"]
+    of_material = [options.normals / MAPS["material"].files[name] for name in ("base_colour.png", GLOSS)]
+    has_material = all(path.is_file() for path in of_material)
+    picture, gloss = options.colours, None
+    of_folder = of_material[0] if has_material else options.normals / MAPS["albedo"].files["png"]
     if picture is None and of_folder.is_file():
         picture = of_folder
-    if picture is not None:
-        image = np.broadcast_to(read_image(picture, ExpectedSize(mask.shape, "the normal map")), (*mask.shape, 3))
-        colours = np.rint(255 * image.clip(0, 1)).astype(np.uint8)
+        gloss = _read_picture(of_material[1], mask.shape) if has_material else None
+    colours = None if picture is None else _read_picture(picture, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
         surface, found = make_surface(
             normal_map,
             mask,
             camera_matrix,
             colours,
+            gloss,
             discontinuity=discontinuity,
             largest_step=options.largest_step,
             n_triangles=options.decimate,
@@ -234,6 +240,12 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H, W)."""
+    image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
+    return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:

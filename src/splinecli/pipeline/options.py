@@ -238,6 +238,9 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     pixels: Annotated[tuple[tuple[int, int], ...], Option("Output", "ROW,COLUMN",
         "With --figures: show the observation maps of this pixel. May be repeated.", names=("--pixel",),
         parse=parse_pixel, repeated=True)] = ()
+    relight: Annotated[bool, Option("Output", "",
+        "Estimate normals and material from the first draw of each capture, render the capture under its other lights,"
+        " and compare with the photographs.")] = False
     output: Annotated[FileName, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = "evaluation"
     overwrite: Annotated[bool, Option("Output", "", "Compute all trials again, also those stored in OUT.")] = False
 

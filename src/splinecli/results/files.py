@@ -49,7 +49,7 @@ def report_of(
     distillation: Mapping[str, Any] | None = None,
     alignment: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the report of an estimate (docs/infer.md), without the surface.
+    """Return the report of an estimate (docs/infer.md), without material and surface.
 
     write_estimate adds `seconds`, `folder` and `files`. The options are the options of `infer` as JSON values. `inputs`
     is a digest that changes when an input file changes. `light_file` is None if the lights were estimated from the
@@ -89,6 +89,7 @@ def report_of(
         white_level=capture.white_level,
         removed_blur=None if capture.removed_blur is None else round(capture.removed_blur, 2),
         alignment=None if alignment is None else convert(alignment, AlignmentReport),
+        material=None,
         surface=None,
     ).as_dict()
 

@@ -55,6 +55,11 @@ def map_files(
     scale: float | None = None,
 ) -> Iterator[tuple[str, Content]]:
     """Yield the files of a map: NPY and PNG whenever the map has them, TIFF and EXR only if they are requested."""
+    for part in row.parts:
+        channels = values[..., part.first : part.last]
+        if part.has_values:
+            yield f"{part.name}.npy", np.squeeze(channels, 2) if channels.shape[2] == 1 else channels
+        yield f"{part.name}.png", encode_png(resolve_name(part.picture)(channels, mask))
     scale = row.scale if scale is None else scale
     for suffix, name in row.files.items():
         if suffix == "npy":
@@ -114,17 +119,10 @@ def albedo_map(
     for start in range(0, len(normals), 65_536):
         tile = slice(start, start + 65_536)
         cosines, attenuation = _shading(capture, normals, tile, range(capture.n_lights))
-        counts[tile] = _agreeing(capture.observations[tile] / attenuation, cosines)
+        counts[tile] = agreeing_lights(capture.observations[tile] / attenuation, cosines)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
-    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
-    for position, colours in enumerate(images):
-        cosines, attenuation = _shading(capture, normals, slice(None), [position])
-        cosine = cosines[:, 0] * counts[:, position]
-        colours /= attenuation
-        if capture.estimated_colours is not None:
-            colours /= capture.estimated_colours[position].astype(np.float32)
-        if capture.estimated_intensities is not None:
-            colours /= np.float32(capture.estimated_intensities[position])
+    for position, colours in enumerate(colours_of_surface(source, capture, normals, progress)):
+        cosine = _shading(capture, normals, slice(None), [position])[0][:, 0] * counts[:, position]
         weight = cosine
         if capture.restored is not None:
             # The colour of a restored observation is saturated, so only the other observations are used.
@@ -136,6 +134,21 @@ def albedo_map(
     albedo = np.zeros((*capture.mask.shape, 3), np.float32)
     albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
     return albedo
+
+
+def colours_of_surface(
+    source: CaptureSource, capture: Capture, normals: NDArray[np.float32], progress: Progress
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the linear RGB values (P, 3) of each image as under a distant white lamp of intensity 1; see albedo_map."""
+    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
+    for position, colours in enumerate(images):
+        colours /= _shading(capture, normals, slice(None), [position])[1]
+        if capture.estimated_colours is not None:
+            colours /= capture.estimated_colours[position].astype(np.float32)
+        if capture.estimated_intensities is not None:
+            colours /= np.float32(capture.estimated_intensities[position])
+        yield colours
+        del colours
 
 
 def _shading(
@@ -150,7 +163,7 @@ def _shading(
     return np.einsum("pfc,pc->pf", directions, normals[pixels]), attenuation
 
 
-def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
+def agreeing_lights(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
     lit = cosine > 0.15  # excludes grazing light
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)

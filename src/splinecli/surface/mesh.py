@@ -39,6 +39,8 @@ class SurfaceMesh:
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if `normals` are
     # exact.
     normal_texture: NDArray[np.uint8] | None = None
+    # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a matte surface
+    gloss: NDArray[np.uint8] | None = None
     tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property

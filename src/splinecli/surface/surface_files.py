@@ -70,7 +70,7 @@ def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -
 
 
 def _encode_glb(surface: Surface) -> bytes:
-    """Encode binary glTF 2.0, in metres: a matte material with the textures, lit from both sides."""
+    """Encode binary glTF 2.0, in metres: the textures, lit from both sides; matte without a texture of the gloss."""
     import trimesh
     from PIL import Image
 
@@ -91,10 +91,14 @@ def _encode_glb(surface: Surface) -> bytes:
         # The last number is the sign of the bitangent.
         buffers["tangents"] = np.insert(mesh.tangents, 3, 1, axis=1).astype("<f4").tobytes()
 
-    textures = {"baseColorTexture": mesh.texture, "normalTexture": mesh.normal_texture}
+    textures = {
+        "baseColorTexture": mesh.texture,
+        "normalTexture": mesh.normal_texture,
+        "metallicRoughnessTexture": mesh.gloss,
+    }
     material = trimesh.visual.material.PBRMaterial(
         name="surface",
-        metallicFactor=0.0,
+        metallicFactor=0.0 if mesh.gloss is None else 1.0,
         roughnessFactor=1.0,
         doubleSided=True,
         baseColorFactor=[GRAY] * 3 + [255] if mesh.texture is None else None,

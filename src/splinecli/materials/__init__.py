@@ -1,0 +1,1 @@
+"""Base colour, roughness, metalness and specular reflection of each pixel, from images, lights and normals."""

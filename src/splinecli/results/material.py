@@ -1,0 +1,75 @@
+"""The material of a capture as a map, and its pictures, in the conventions of glTF."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from splinecli.capture import CaptureSource
+from splinecli.capture.linearise import take_pixels
+from splinecli.documents import MaterialFacts
+from splinecli.inference import lighting_on
+from splinecli.maths import Bools, Float32Array
+from splinecli.maths.transfer import encode_srgb
+from splinecli.pictures.maps import Picture
+from splinecli.results.maps import Progress, colours_of_surface
+
+if TYPE_CHECKING:
+    from splinecli.inference import NormalEstimate
+    from splinecli.materials.maps import MaterialMaps
+
+
+def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
+    """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero outside the mask.
+
+    Raises InputError if an image can no longer be read, or there are too few lights.
+    """
+    normals = take_pixels(estimate.normal_map, estimate.capture.mask)
+    found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
+    maps = np.zeros((*estimate.capture.mask.shape, 7), np.float32)
+    columns = (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
+    maps[estimate.capture.mask] = np.column_stack(columns)
+    return maps
+
+
+def material_of(estimate: NormalEstimate, colours: Iterable[Float32Array] | None = None) -> MaterialMaps:
+    """Return the material of a capture; see estimate_material for the arguments and the errors."""
+    from splinecli.materials.maps import estimate_material
+
+    capture, confidence = estimate.capture, estimate.confidence_map
+    return estimate_material(
+        capture.mask,
+        take_pixels(estimate.normal_map, capture.mask),
+        capture.light_directions,
+        partial(lighting_on(capture), None),
+        normal_confidence=None if confidence is None else confidence[capture.mask],
+        colours=colours,
+    )
+
+
+def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
+    """Return the facts that the report states about a material; gray images have equal channels."""
+    red, green, blue, *_, confidence = maps[mask].T
+    is_gray = bool((red == green).all() and (green == blue).all())
+    return MaterialFacts(gray=is_gray, mean_confidence=round(float(confidence.mean()), 4))
+
+
+def share_picture(values: Float32Array, _: Bools) -> Picture:
+    """Return values (H, W, 1) as a gray picture (H, W): 0 is black, 1 and more is white."""
+    return np.asarray(np.rint(255 * values[..., 0].clip(0, 1)), np.uint8)
+
+
+def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
+    """Return a linear base colour (H, W, 3) as an sRGB picture."""
+    return encode_srgb(base_colour)
+
+
+def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
+    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue, linear.
+
+    Red is for occlusion in glTF; it is white in the mask.
+    """
+    return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)

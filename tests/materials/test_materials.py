@@ -1,0 +1,272 @@
+"""Materials of spheres shaded by an independent implementation of Lambert's law and GGX, and of a rendered scene."""
+
+import json
+from pathlib import Path
+
+import cv2
+import jsonschema
+import numpy as np
+import pytest
+
+from glb_file import read_glb
+from scenes import cap_directions, sphere, write_capture
+from splinecli import estimate_material
+from splinecli.capture import open_capture
+from splinecli.errors import InputError
+from splinecli.evaluation.relighting import likeness
+from splinecli.inference import estimate_normals
+from splinecli.lights.lighting import PixelLighting
+from splinecli.materials import maps
+from splinecli.materials.maps import MaterialMaps, render_gray
+from splinecli.methods import make_estimator
+from splinecli.output_files import MAPS
+from splinecli.pipeline.evaluate import evaluate_captures
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.integrate import integrate_normal_map
+from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
+from splinecli.results.maps import make_map, map_files
+from splinecli.results.material import material_facts
+
+SIZE = 48
+LIGHTS = cap_directions(12, 60, seed=4, even=True)
+NORMAL_MAP, MASK = sphere(SIZE, 0.9)
+NORMALS = NORMAL_MAP[MASK].astype(np.float32)
+SURE = np.full(len(NORMALS), 0.999, np.float32)
+
+
+def ggx_sphere(lights, *, diffuse, f0, roughness):
+    """Radiance (P, F) times pi of a Lambertian base under GGX facets (Walter et al., EGSR 2007), without Fresnel."""
+    alpha = roughness**2
+    half = lights + np.array((0, 0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    n_l, n_h, n_v = (NORMALS @ lights.T).clip(0), (NORMALS @ half.T).clip(0), NORMALS[:, 2:]
+    facets = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2)
+
+    def masking(cosine):
+        return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2) + 1e-12)
+
+    specular = facets * masking(n_l) * masking(n_v) / np.maximum(4 * n_l * n_v, 1e-9)
+    return (n_l * (np.asarray(diffuse).reshape(-1, 1) + np.pi * f0 * specular)).astype(np.float32)
+
+
+def material(observations, lights=LIGHTS, colours=None) -> MaterialMaps:
+    return maps.estimate_material(
+        MASK,
+        NORMALS,
+        lights,
+        lambda pixels: PixelLighting(observations[pixels], lights),
+        normal_confidence=SURE,
+        colours=colours,
+    )
+
+
+@pytest.mark.parametrize("roughness", [0.35, 0.5])
+def test_a_dielectric_sphere(roughness):
+    found = material(ggx_sphere(LIGHTS, diffuse=0.5, f0=0.04, roughness=roughness))
+    assert abs(np.median(found.roughness) - roughness) < 0.08
+    assert found.metalness.max() < 0.1
+    assert np.median(found.specular) == pytest.approx(0.5, rel=0.05)  # by definition of the exposure
+    # With f0 = 0.04, the exposure and the base are absolute, as exact as the reflectance of the facets.
+    assert found.exposure == pytest.approx(1, abs=0.25)
+    assert np.median(found.base_colour) * found.exposure == pytest.approx(0.5, rel=0.05)
+    assert np.quantile(np.abs(found.base_colour / np.median(found.base_colour) - 1), 0.8) < 0.1
+
+
+@pytest.mark.parametrize("roughness", [0.35, 0.6])
+def test_a_metal_sphere(roughness):
+    found = material(ggx_sphere(LIGHTS, diffuse=0.0, f0=0.8, roughness=roughness))
+    assert abs(np.median(found.roughness) - roughness) < 0.08
+    assert (found.metalness > 0.5).mean() > 0.98
+    assert found.base_colour.max() < 1.2
+
+
+def test_paint_in_two_colours_has_one_gloss():
+    """White highlights do not tint the base colour."""
+    left = NORMALS[:, 0] < 0
+    paint = np.where(left[:, None], (0.6, 0.2, 0.1), (0.1, 0.3, 0.5))
+    channels = [ggx_sphere(LIGHTS, diffuse=paint[:, c], f0=0.04, roughness=0.4) for c in range(3)]
+    colours = [np.stack([channel[:, place] for channel in channels], axis=1) for place in range(len(LIGHTS))]
+    found = material(np.mean(channels, axis=0), colours=colours)
+    assert not found.is_gray
+    assert np.abs(found.roughness - 0.4).mean() < 0.08
+    tint = found.base_colour / found.base_colour.mean(axis=1, keepdims=True)
+    assert np.quantile(np.abs(tint - paint / paint.mean(axis=1, keepdims=True)), 0.95) < 0.05
+
+
+def test_units_and_order_of_lights():
+    """Seven times the light is seven times the exposure, and nothing else; the order of the lights does not count."""
+    observations = ggx_sphere(LIGHTS, diffuse=0.4, f0=0.05, roughness=0.4)
+    plain, bright = material(observations), material(7 * observations)
+    turned = material(observations[:, ::-1].copy(), LIGHTS[::-1])
+    assert bright.exposure == pytest.approx(7 * plain.exposure, rel=1e-3)
+    for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
+        np.testing.assert_allclose(getattr(bright, name), getattr(plain, name), atol=1e-3)
+        np.testing.assert_allclose(getattr(turned, name), getattr(plain, name), atol=1e-3)
+
+
+def test_confidence_is_low_where_no_highlight_could_be_observed():
+    matte = material(ggx_sphere(LIGHTS, diffuse=0.5, f0=0.0, roughness=0.5))
+    assert matte.confidence.max() < 0.1
+    lights = cap_directions(8, 15, seed=2) + np.array((1.0, 0, 0))  # all from the right
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    found = material(ggx_sphere(lights, diffuse=0.3, f0=0.05, roughness=0.35), lights)
+    half = lights + np.array((0, 0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    nearest_deg = np.degrees(np.arccos((NORMALS @ half.T).clip(-1, 1))).min(axis=1)
+    assert found.confidence[nearest_deg < 8].mean() > 3 * found.confidence[nearest_deg > 30].mean()
+    assert 0 <= found.confidence.min() <= found.confidence.max() <= 1
+
+
+def test_pictures_under_other_lights():
+    """A sharp highlight under 12 lights predicts those under 5 others."""
+    others = cap_directions(5, 50, seed=9, even=True)
+    found = material(ggx_sphere(LIGHTS, diffuse=0.3, f0=0.06, roughness=0.4))
+    truth = ggx_sphere(others, diffuse=0.3, f0=0.06, roughness=0.4)
+    pictures = render_gray(found, NORMALS, others, np.ones(truth.shape, bool), SURE)
+    matte = 0.3 * (NORMALS @ others.T).clip(0).astype(np.float32)
+    ours, lambertian = likeness(truth, pictures), likeness(truth, matte)
+    assert ours.psnr_db > lambertian.psnr_db + 6
+    assert ours.error < 0.06
+
+
+def test_likeness_of_known_noise():
+    photographs = np.linspace(0, 1, 100_000, dtype=np.float32).reshape(-1, 10)
+    found = likeness(photographs, photographs + np.where(np.arange(10) % 2, 0.01, -0.01).astype(np.float32))
+    assert found.psnr_db == pytest.approx(40, abs=0.05)  # 0.01 of white
+    assert found.error == pytest.approx(0.02, rel=0.01)  # of a mean of 0.5
+
+
+def test_channels_of_the_pictures():
+    values = np.tile(np.array((1, 0.5, 0, 0.2, 0.8, 3, 0.4), np.float32), (SIZE, SIZE, 1)) * MASK[..., None]
+    files = dict(map_files(MAPS["material"], values, MASK, ["tiff"]))
+    assert set(files) == set(MAPS["material"].files)
+    pictures = {
+        name: cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        for name, content in files.items()
+        if name.endswith(".png")
+    }
+    middle = SIZE // 2, SIZE // 2
+    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [255, 51, 204]  # occlusion, roughness, metal
+    assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
+    assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
+    assert files["specular.npy"][middle] == 3
+    assert not files["roughness.npy"][0, 0]
+    assert not material_facts(values, MASK).gray
+
+
+@pytest.fixture
+def glossy(tmp_path: Path) -> Path:
+    """A gray capture of a glossy sphere."""
+    images = np.zeros((len(LIGHTS), SIZE, SIZE))
+    images[:, MASK] = ggx_sphere(LIGHTS, diffuse=0.3, f0=0.05, roughness=0.4).T
+    stored = np.rint(images.clip(0, 1) * 65535).astype(np.uint16)
+    return write_capture(tmp_path / "ball", stored, LIGHTS, mask=MASK, normals=NORMAL_MAP * MASK[..., None])
+
+
+def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
+    options = InferOptions(method="ls", maps=("material",), surface=True, output=str(tmp_path / "out"))
+    report = infer_capture(glossy, options)
+    folder = tmp_path / "out/ball"
+    assert report["material"]["gray"]
+    assert "gray_material" in [warning["code"] for warning in report["warnings"]]
+    base = np.load(folder / "base_colour.npy")
+    assert (base.dtype, base.shape) == (np.float32, (SIZE, SIZE, 3))
+    assert (base[..., 0] == base[..., 2]).all()
+    tree, arrays = read_glb((folder / "mesh.glb").read_bytes())
+    [shown] = tree["materials"]
+    gloss = shown["pbrMetallicRoughness"]
+    assert {"baseColorTexture", "metallicRoughnessTexture"} <= set(gloss)
+    assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
+    stored = cv2.imread(str(folder / "metallic_roughness.png"))[..., ::-1]
+    np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
+
+
+def test_three_lights_are_refused(glossy, tmp_path):
+    options = InferOptions(
+        method="ls", maps=("material",), light_indices=(0, 1, 2), output=str(tmp_path / "out"), as_stored=True
+    )
+    with pytest.raises(InputError, match="3 lights do not determine the material, expected at least 4"):
+        infer_capture(glossy, options)
+
+
+def test_a_black_capture_has_some_material(tmp_path):
+    """Without light there is nothing to know, and no NaN."""
+    found = material(np.zeros((len(NORMALS), len(LIGHTS)), np.float32))
+    for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
+        assert np.isfinite(getattr(found, name)).all()
+    assert found.confidence.max() < 0.1
+
+
+def test_a_rendered_scene(tmp_path):
+    """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is wrong by 0.24."""
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+
+    config = SceneConfig(size=32, lights=12, samples=2, directions=8, bounces=1)
+    scene = draw_scene(7100, 3, config)
+    rendered = render_scene(scene, config)
+    wrong = []
+    for name in ("specular", "metallic"):
+        observations = rendered.observations[name]
+        found = maps.estimate_material(
+            rendered.mask,
+            rendered.normals,
+            scene.lights,
+            lambda rows, o=observations: PixelLighting(o[rows], scene.lights),
+        )
+        true = scene.materials[name]
+        wrong.append(abs(float(np.median(found.roughness)) - float(true.roughness.median())))
+    assert np.mean(wrong) < 0.25
+
+
+def test_colours_are_read_once_more(glossy):
+    source = open_capture(glossy)
+    steps = []
+    estimate = estimate_normals(source.read(), make_estimator("ls"))
+    assert make_map(MAPS["material"], source, estimate, lambda: steps.append(1)) is not None
+    assert len(steps) == len(LIGHTS)
+
+
+def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path):
+    options = EvaluateOptions(
+        datasets=(glossy,), methods=("ls",), n_lights=(8,), trials=1, relight=True, output=str(tmp_path / "scores")
+    )
+    [found] = evaluate_captures(options).document["relighting"]
+    assert (found["capture"], found["method"], len(found["lights"]), found["held_out"]) == ("ball", "ls", 8, 4)
+    assert found["material"]["psnr_db"] > found["lambertian"]["psnr_db"] + 1
+    assert found["lambertian"]["psnr_db"] > found["nearest"]["psnr_db"]
+    written = json.loads((tmp_path / "scores/results.json").read_text("utf-8"))
+    schema = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator({**schema, "$ref": "#/$defs/Results"}).validate(written)
+
+
+def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
+    options = EvaluateOptions(
+        datasets=(glossy,), methods=("ls",), n_lights=(None,), relight=True, output=str(tmp_path / "scores")
+    )
+    outcome = evaluate_captures(options)
+    assert outcome.figure_problems == ["ball: no light is held out. Use fewer --n-lights."]
+
+
+def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
+    """The gains of a camera's channels are not known, so they tint the base colour."""
+    estimate = estimate_normals(open_capture(glossy).read(), make_estimator("ls"))
+    images = np.zeros((len(LIGHTS), SIZE, SIZE, 3), np.float32)
+    images[:, MASK] = estimate.capture.observations.T[..., None]
+    gains = np.array((1.5, 1, 0.5), np.float32)
+    white, tinted = estimate_material(estimate, images), estimate_material(estimate, images * gains)
+    assert white.is_gray
+    assert not tinted.is_gray
+    np.testing.assert_array_equal(tinted.roughness, white.roughness)
+    np.testing.assert_array_equal(tinted.metalness, white.metalness)
+    ratio = np.median(tinted.base_colour / white.base_colour, axis=0)
+    np.testing.assert_allclose(ratio / ratio[1], gains, atol=0.1)  # white highlights are assumed to be white
+
+
+def test_integrate_keeps_the_material(glossy, tmp_path):
+    infer_capture(glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out")))
+    integrate_normal_map(IntegrateOptions(normals=tmp_path / "out/ball"))
+    _, arrays = read_glb((tmp_path / "out/ball/mesh.glb").read_bytes())
+    stored = cv2.imread(str(tmp_path / "out/ball/metallic_roughness.png"))[..., ::-1]
+    np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
