@@ -195,7 +195,7 @@ TABLES = {
         ("sizes",),
         "megapixels",
         same(SIZES),
-        same(("processor s", "memory MiB", "processor s a megapixel", "processor s, AVX2 alone")),
+        same(("processor s", "memory MiB", "processor s a megapixel")),
         "{:,.0f}",
     ),
 }
