@@ -1,6 +1,7 @@
 """The seconds that `infer` is expected to take for each stage of a capture: for its progress bar, and for `info`.
 
-The costs were measured on two cores (benchmarks/large_captures.py), with and without native bfloat16.
+The costs were measured on two cores, with native bfloat16 and with AVX2 alone (benchmarks/large_captures.py). Other
+processors may differ from them by a factor of two.
 """
 
 from pathlib import Path
@@ -29,7 +30,7 @@ class _Costs(NamedTuple):
 
 
 _BFLOAT16 = _Costs(1.4e-7, 1.3e-4, 1.0e-6, 3.0e-5, 7e-7, 1.6e-3, 3e-7)
-_FLOAT32 = _Costs(1.4e-7, 2.4e-4, 1.7e-6, 5.5e-5, 8e-7, 2.0e-3, 3e-7)
+_FLOAT32 = _Costs(1.8e-7, 4.0e-4, 2.2e-6, 9.0e-5, 1.3e-6, 2.0e-3, 3e-7)  # AVX2
 _OTHER_METHODS = 4e-5  # per pixel
 _UNLIKE = 0.005  # share of pixels that the network estimates beside a distilled estimator
 _INDIRECT = 0.3  # share of the pixels that are usually estimated again
