@@ -76,7 +76,7 @@ def evaluate(options: EvaluateOptions) -> int:
     for entry in outcome.document["skipped"]:
         talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:
-        talk.error(f"no figure or relighting: {problem}")
+        talk.error(f"no {'figure or relighting' if options.relight else 'figure'}: {problem}")
     for warning in outcome.warnings:
         talk.warn(warning)
     for note in outcome.document["notes"]:
