@@ -89,6 +89,9 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "matrix.txt").write_text("1 1 1\n1 1 1\n1 1 1.1\n")
     with pytest.raises(InputError, match="do not separate the lamps"):
         channel_lights(tmp_path / "matrix.txt", 1)
+    (tmp_path / "matrix.txt").write_text("1 0 0\n0 1 0\n0 -0.2 1\n")
+    with pytest.raises(InputError, match=r"found the negative response -0\.2"):
+        channel_lights(tmp_path / "matrix.txt", 1)
     (tmp_path / "matrix.txt").write_text("1 0\n0 1\n")
     with pytest.raises(InputError, match="found 2 x 2 numbers, expected 3 x 3"):
         normals_of(tmp_path / "gray", tmp_path / "out", crosstalk=str(tmp_path / "matrix.txt"))

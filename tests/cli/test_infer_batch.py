@@ -146,8 +146,8 @@ def test_options_are_written_and_read_back(capture, run):
     assert read_report(Path("elsewhere/sphere"))["options"] == options.as_dict()
     assert options.changes(InferOptions.from_dict({**options.as_dict(), "output": "x", "device": "cpu"})) == []
     assert options.changes(InferOptions.from_dict({**options.as_dict(), "seed": 4})) == ["--seed"]
-    contradiction = {"mask": "m.png", "auto_mask": True}
-    for wrong in ({"formats": ("bmp",)}, {"maps": ("depth",)}, {"convention": "up"}, contradiction):
+    contradictions = {"mask": "m.png", "auto_mask": True}, {"align": True, "scale": "1/2"}
+    for wrong in ({"formats": ("bmp",)}, {"maps": ("depth",)}, {"convention": "up"}, *contradictions):
         with pytest.raises(UsageError):
             InferOptions(**wrong)
 

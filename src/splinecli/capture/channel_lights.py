@@ -45,17 +45,22 @@ class ChannelLights:
         text = "The channels R, G, B of each image count as photographs under three lamps. This is right for gray"
         text += " objects only: the normals of coloured ones are wrong."
         if not self.measured:
-            text += f" There is no {CROSSTALK}, so each channel counts as blind to the other lamps: measure it with"
+            text += (
+                f" There is no {CROSSTALK}, so each channel is assumed to respond to its own lamp only: measure it with"
+            )
             text += " calibrate --gray-ball DIR --lights-in-channels."
         return text
 
 
 def check_crosstalk(matrix: Float64Array, path: Path) -> None:
     """Raise InputError if the channels (3, 3) do not separate the lamps."""
+    if (matrix < 0).any():
+        raise InputError(f"found the negative response {matrix.min():g}, expected numbers of at least 0", path=path)
     condition = np.linalg.cond(matrix) if np.isfinite(matrix).all() else np.inf
     if condition > LARGEST_CONDITION:
-        problem = f"the channels do not separate the lamps: the crosstalk matrix has the condition {condition:.0f}"
-        hint = f"Expected at most {LARGEST_CONDITION:.0f}: use lamps of more different colours"
+        number = f"the condition number {condition:.0f}" if condition < 1e6 else "no inverse"
+        problem = f"the channels do not separate the lamps: the crosstalk matrix has {number}"
+        hint = f"Expected a condition number of at most {LARGEST_CONDITION:.0f}: use lamps of more different colours"
         raise InputError(problem, path=path, hint=hint)
 
 

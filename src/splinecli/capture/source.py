@@ -39,6 +39,7 @@ from splinecli.capture_warnings import (
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.restoration.alignment import (
+    LARGEST_MOTION,
     LEAST_FIT,
     MIN_IMAGES,
     AlignedImages,
@@ -224,9 +225,18 @@ class CaptureSource:
         found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)
         if found.unexplained is not None:
             name, moved = names[found.unexplained], stride * self.window.step * found.moved_pixels[found.unexplained]
+            if found.largest > LARGEST_MOTION:
+                problem = (
+                    f"--align found a motion of {moved:.0f} pixels for {name}, at one pixel {100 * found.largest:.0f} %"
+                    f" of the object's size; expected at most {100 * LARGEST_MOTION:.0f} %"
+                )
+                hint = (
+                    "Read a larger part of the images, leave the image out with --light-indices, or leave --align out"
+                )
+                raise InputError(problem, path=self.files.folder, hint=hint)
             problem = (
                 f"--align cannot explain {name}: moved by {moved:.0f} pixels, its correlation with the prediction of"
-                f" the other images is {found.fits[found.unexplained]:.2f}, expected {LEAST_FIT}"
+                f" the other images is {found.fits[found.unexplained]:.2f}, expected at least {LEAST_FIT}"
             )
             hint = "Leave it out with --light-indices, mask the object if others moved with it, or leave --align out"
             raise InputError(problem, path=self.files.folder, hint=hint)
@@ -243,7 +253,7 @@ class CaptureSource:
         if not (found.transforms != np.eye(3)).any():
             how = "None moved by a tenth of a pixel, so they were left as they are"
         elif share < 1:
-            how += f"; the {100 - 100 * share:.1f} % of the object that not all of them show are left out"
+            how += f"; the {100 - 100 * share:.1f} % of the object that some of them do not show is left out"
         warning = CaptureWarning(IMAGES_ALIGNED, f"The images were aligned to {names[0]}. {how}.")
         aligned = AlignedImages(names[0], found.model, transforms, moved, common)
         return replace(self, alignment=aligned, warnings=(*self.warnings, warning))

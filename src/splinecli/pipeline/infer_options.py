@@ -201,6 +201,9 @@ class Reading(Record, frozen=True, kw_only=True):
                 raise UsageError(problem, hint=f"Leave {option} out, or give a light file")
         if self.crosstalk is not None and not self.lights_in_channels:
             raise UsageError("--crosstalk needs --lights-in-channels", hint="Add it, or leave both out")
+        if self.align and self.scale is not None:
+            problem = "--align needs every row and column, so it contradicts --scale"
+            raise UsageError(problem, hint="Leave one out, or use --crop for a first look")
         if self.lights_in_channels and self.align:
             raise UsageError("--lights-in-channels and --align contradict each other", hint="Leave one out")
         if self.first_light is not None and not self.finds_lights:

@@ -75,8 +75,9 @@ def make_surface(
     matrix.
     """
     if camera_matrix is not None and (level is not None or pixel_aspect != 1):
-        problem = "--level and --pixel-aspect need an orthographic camera, but there is a camera matrix"
-        raise UsageError(problem, hint="Its fx and fy describe the pixels; level the surface elsewhere")
+        option = "--pixel-aspect" if level is None else "--level"
+        hint = "Its fx and fy describe the pixels" if level is None else "Level the mesh in another program"
+        raise UsageError(f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint)
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
