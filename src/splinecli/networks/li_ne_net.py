@@ -103,8 +103,8 @@ class MapEncoder(nn.Module):
 
     def _few_products(self, maps: Tensor) -> Tensor:
         """Return the same features of maps of SIDE x SIDE patches by Winograd's algorithm, in half of the time."""
-        layers = [winograd_weights(layer.weight) for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
-        offsets = [layer.bias for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
+        convolutions = [layer for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
+        layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
         found = maps.new_empty(len(maps), SIDE**2, self.position.shape[1])
         for start in range(0, len(maps), _AT_ONCE):
@@ -112,9 +112,8 @@ class MapEncoder(nn.Module):
             split = maps[start : start + _AT_ONCE].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
             patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
             x = nn.functional.linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
-            for first in range(0, len(layers), 2):
-                change = winograd_conv(x.relu(), layers[first], offsets[first]).relu_()
-                x = winograd_conv(change, layers[first + 1], offsets[first + 1]).add_(x)
+            for first, second in zip(layers[::2], layers[1::2], strict=True):  # of each residual block
+                x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
             found[start : start + _AT_ONCE] = x.transpose(0, 1)
         return found.transpose(1, 2).view(-1, self.position.shape[1], SIDE, SIDE)
 

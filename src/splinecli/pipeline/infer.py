@@ -271,13 +271,12 @@ def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> t
     height, width, *_ = source.facts[0].size[0]
     seconds = partial(expected_seconds, n_images=count, image_pixels=height * width, network=network)
     clock.expect(seconds(height * width, distils=options.distil))
+    for_mask = source.n_lights * options.auto_mask  # images that are read to find the object, also after aligning
+    advance = clock.begin("read", (count + for_mask) * (1 + options.align), "reading")
     if options.auto_mask:
-        advance = clock.begin("read", 2 * source.n_lights, "finding the object")
-        source = source.find_mask(lambda: advance(1))
+        source = source.find_mask(lambda: advance(1, "finding the object"))
     if options.align:
-        advance = clock.begin("read", 2 * count, "aligning")
-        source = align(source, indices, lambda: advance(1))
-    advance = clock.begin("read", count, "reading")
+        source = align(source, indices, lambda: advance(1, "aligning"))
     capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
     rest = seconds(capture.n_pixels, distils=options.distil)
     clock.expect({stage: rest[stage] for stage in rest if stage != "read"})
