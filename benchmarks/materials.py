@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.evaluation.relighting import lambertian, likeness
 from splinecli.inference import estimate_normals, lighting_on
-from splinecli.materials.basis import Geometry
+from splinecli.materials.lobes import Geometry
 from splinecli.materials.maps import estimate_material, lights_that_reach, render_gray
 from splinecli.methods import make_estimator
 from splinecli.synthesis.principled import PrincipledMaterial

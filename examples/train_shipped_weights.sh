@@ -33,5 +33,8 @@ run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136
 run cnn-ps-2 scenes --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
 
+# The material net reads the tokens of the spline-net in the package, so put the new weights there first.
+#   python benchmarks/train_material_net.py draw "$folder/material"
+#   python benchmarks/train_material_net.py train "$folder/material" --ship
 echo "$folder/spline-net-4/weights.safetensors"
 echo "$folder/cnn-ps-2/weights.safetensors"

@@ -12,41 +12,33 @@ from torch import Tensor
 
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting, parts_of_pixels
 from splinecli.lights.rough_normals import cast_shadows
-from splinecli.materials.basis import (
+from splinecli.materials.gloss import GlossMaps, estimate_gloss
+from splinecli.materials.lobes import (
     F0_OF_SPECULAR,
-    GGX,
+    Base,
     Geometry,
-    Gloss,
     Sample,
     diffuse_lobe,
     facet_lobe,
-    find_glosses,
     fit_base,
-    fit_gloss,
     lobe_error,
-    noise_floor,
     predict_left_out,
 )
 from splinecli.maths import Bools, Float32Array, Floats
 from splinecli.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
-_SAMPLE = 1200  # pixels from which the glosses are found
-_LIT = 0.05  # n.l from which a light counts; the rounded rim of a shadow is below
-_BRIGHT_QUANTILE, _ABOVE_BRIGHT = 0.95, 1.2
-_DARK = 0.1  # of the median brightness; darker pixels are background or in shadow, and are not sampled
-_SMOOTH = 4.0  # pixels: standard deviation of the mean over which a pixel's gloss is decided
-_SHARPNESS = 4.5  # how much the mean of so many costs counts
+_LIT = 0.05  # n.l from which a light is used; the rounded rim of a shadow is below
+_BRIGHT_QUANTILE = 0.95
+_SMOOTH = 4.0  # pixels: standard deviation of the mean over which the trust is decided
 _DIELECTRIC = 0.04  # mean reflectance of dielectrics at normal incidence, which determines the exposure
 _WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
 _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
-_USUAL_SPECULAR = 0.5  # of glTF, where there is no dielectric
-_UNKNOWN = 0.26  # standard deviation of a roughness of which nothing is known
-_FLAT = 0.1  # of the mean observation: an error of all observations in the last fit, so that dark ones do not decide
+_SURE = 0.1  # the error of a roughness that the confidence refers to
+_LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
+_FLOOR, _FLAT = 0.005, 0.12  # of the bright pixels' albedo and the mean observation: errors of all observations
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
-_STEP = 0.15  # of roughness
-_INFORMATION = 4.0  # squared standard deviations by which such a step changes a pixel, of confidence 0.5
 _NORMAL_ERROR = 0.04  # radians, without a confidence
 _LEAST_ERROR, _MOST_ERROR = 0.015, 0.25  # radians
 _CONFIDENT = np.radians(5)  # the error that the confidence of a normal refers to
@@ -61,7 +53,7 @@ class MaterialMaps:
         the scale is chosen such that dielectrics reflect 4 % on average, but never so that the brightest bases exceed
         white.
     roughness, metalness, specular: (P,), Burley's parameters. `specular` may exceed 1.
-    confidence: (P,), from 0, where no highlight could have been observed, to 1.
+    confidence: (P,), the probability that the roughness is wrong by at most 0.1.
     minnaert, tail: (P,), exponents of the diffuse light and of the facets' distribution, which glTF does not have.
     matte: (P,), the reflectance of a matte surface that fits best, in the unit of the observations.
     trust: (P,), the share of the material in pictures; the rest is matte. It is chosen by how well each predicts
@@ -92,7 +84,6 @@ def estimate_material(
     *,
     normal_confidence: Float32Array | None = None,
     colours: Iterable[Float32Array] | None = None,
-    seed: int = 0,
 ) -> MaterialMaps:
     """Estimate the material of each pixel of a mask (H, W).
 
@@ -103,7 +94,6 @@ def estimate_material(
         normal_confidence: (P,), the probability that a normal is off by at most 5 degrees. None if it is unknown.
         colours: for each light, the linear RGB values (P, 3) whose channels have the observations as their mean; None
             for gray images.
-        seed: of the sample of pixels.
 
     Raises:
         InputError: there are too few lights.
@@ -114,30 +104,26 @@ def estimate_material(
     pixels = _Pixels(
         normals, _normal_error(normals, normal_confidence), lights_that_reach(normal_map, mask, lights), lighting_at
     )
-    bright, middle, white = pixels.brightness()
-    rng = np.random.default_rng(seed)
-    glosses = find_glosses(pixels.take(pixels.choose(rng, middle), bright), bright)
-    found = _Mixture(glosses, *_shares_of_glosses(mask, glosses, pixels, bright))
-    columns = np.empty((len(normals), 6), np.float32)
+    bright, white = pixels.brightness()
+    gloss = estimate_gloss(mask, lighting_at)
+    columns = np.empty((len(normals), 5), np.float32)
     weights = np.empty(pixels.reached.shape, np.float32)
     for chosen in parts_of_pixels(len(normals)):
-        columns[chosen], weights[chosen] = found.fit(pixels.take(chosen, bright, white), chosen)
-    gray, confidence, offset, matte, agreement, difference = columns.T
+        columns[chosen], weights[chosen] = _fit(pixels.take(chosen, bright, white), gloss, chosen)
+    gray, offset, matte, agreement, difference = columns.T
     trust = _smooth(agreement, mask) / np.maximum(_smooth(difference, mask), 1e-12 * bright**2)
     tint = None if colours is None else _tint(colours, weights, offset)
     is_gray = tint is None or bool(np.abs(tint - 1).max() < _GRAY)
     base = np.repeat(gray[:, None], 3, axis=1) * (1 if tint is None or is_gray else tint)
-    exposure = _exposure(base, found)
+    exposure = _exposure(base, gloss)
     return MaterialMaps(
         base_colour=base / np.float32(exposure),
-        roughness=found.mean("roughness"),
-        metalness=1 - found.dielectric,
-        specular=np.where(
-            found.dielectric > 0, found.level / (F0_OF_SPECULAR * exposure), np.float32(_USUAL_SPECULAR)
-        ).astype(np.float32),
-        confidence=confidence.copy(),
-        minnaert=found.mean("minnaert"),
-        tail=found.mean("tail"),
+        roughness=gloss.roughness,
+        metalness=gloss.metalness,
+        specular=gloss.level / np.float32(F0_OF_SPECULAR * exposure),
+        confidence=np.asarray(1 - np.exp(-_SURE / gloss.roughness_error), np.float32),
+        minnaert=gloss.minnaert,
+        tail=gloss.tail,
         matte=matte.copy(),
         trust=trust.clip(0, 1),
         white=white,
@@ -218,81 +204,43 @@ class _Pixels:
         directions = torch.from_numpy(np.asarray(light.directions, np.float32))
         geometry = Geometry.of(own, directions, torch.from_numpy(self.normal_error[chosen]))
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
-        return Sample(observations, geometry, reached.float(), noise_floor(observations, bright), white)
+        floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
+        return Sample(observations, geometry, reached.float(), floor, white)
 
-    def brightness(self) -> tuple[float, float, float]:
-        """Return the albedo of bright pixels, the median mean observation, and the value of white in a picture."""
-        albedos, means, whites = [], [], []
+    def brightness(self) -> tuple[float, float]:
+        """Return the albedo of bright pixels, and the value of white in a picture."""
+        albedos, whites = [], []
         for chosen in parts_of_pixels(len(self.normals), step=max(1, len(self.normals) // 50_000)):
             sample = self.take(chosen, 0.0)
             cosines = sample.geometry.n_dot_l
             albedo = torch.where(cosines > 2 * _LIT, sample.observations / cosines.clamp(min=2 * _LIT), torch.nan)
             albedos.append(albedo.nanmedian(1).values.nan_to_num())
-            means.append(sample.observations.mean(1))
             whites.append(np.quantile(sample.observations.numpy(), _WHITE))
-        bright = float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE))
-        return max(_ABOVE_BRIGHT * bright, 1e-12), float(torch.cat(means).median()), float(np.mean(whites))
-
-    def choose(self, rng: np.random.Generator, middle: float) -> PixelIndices:
-        """Return random pixels that are not dark, or any if all are."""
-        chosen = np.sort(rng.permutation(len(self.normals))[:_SAMPLE])
-        lit = self.lighting_at(chosen).observations.mean(axis=1) > _DARK * middle
-        return chosen[lit] if lit.any() else chosen
+        return max(float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE)), 1e-12), float(np.mean(whites))
 
 
-class _Mixture:
-    """The glosses of the pixels, mixed by their shares."""
+def _fit(sample: Sample, gloss: GlossMaps, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
+    """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
-    def __init__(self, glosses: list[Gloss], shares: Float32Array, usual: list[float]) -> None:
-        self._glosses, self._shares = glosses, shares
-        self._usual = np.asarray(shares @ np.array(usual, np.float32))
-        self.dielectric = shares @ np.array([not gloss.is_metal for gloss in glosses], np.float32)
-        level = shares @ np.array([0.0 if gloss.is_metal else gloss.level for gloss in glosses], np.float32)
-        self.level = level / np.maximum(self.dielectric, 1e-6)
+    The columns are base, the contribution of white highlights to the weighted observations, which is not part of the
+    base, and the results of _compare.
+    """
 
-    def mean(self, name: str) -> Float32Array:
-        """Return the mean of a parameter of the glosses (P,)."""
-        return np.asarray(self._shares @ np.array([getattr(gloss, name) for gloss in self._glosses], np.float32))
+    def column(values: Float32Array) -> Tensor:
+        return torch.from_numpy(values[chosen])[:, None]
 
-    def fit(self, sample: Sample, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
-        """Return six columns (p, 6), and the weights (p, F) of the observations in the base.
-
-        The columns are base, confidence, the contribution of white highlights to the weighted observations, which is
-        not part of the base, and the results of _compare.
-        """
-        shares = torch.from_numpy(self._shares[chosen])
-
-        def mean(values: list[float]) -> Tensor:
-            return (shares @ torch.tensor(values))[:, None]
-
-        glosses, geometry = self._glosses, sample.geometry
-        roughness = mean([gloss.roughness for gloss in glosses])
-        facets = facet_lobe(geometry, roughness, mean([gloss.tail for gloss in glosses]))
-        diffuse = diffuse_lobe(geometry, mean([gloss.minnaert for gloss in glosses]))
-        metallic = mean([float(gloss.is_metal) for gloss in glosses])
-        level = torch.from_numpy(self.level[chosen])[:, None]
-        error = lobe_error(geometry, roughness)
-        usual = float(np.median(self._usual[chosen]))
-        fitted = sample._replace(floor=sample.floor + _FLAT * sample.observations.mean(1))
-        _, base, weights = fit_base(fitted, diffuse, facets, metallic, level, error, usual)
-        slope, offset = torch.lerp(diffuse, facets, metallic), level * (1 - metallic) * facets
-        # The information of a pixel on its roughness: by how much another one would change its observations.
-        other = facet_lobe(
-            geometry,
-            torch.where(roughness < 0.6, roughness + _STEP, roughness - _STEP),
-            torch.full_like(roughness, GGX),
-        )
-        change = (base * metallic + level * (1 - metallic)) * (other - facets)
-        weight = weights[:, 0]
-        square = (weight * slope**2).sum(1, keepdim=True).clamp(min=1e-12)
-        of_base = (weight * slope * change).sum(1, keepdim=True) / square
-        information = (weight * (change - of_base * slope) ** 2).sum(1)
-        known = mean([1 - min(1.0, gloss.roughness_error / _UNKNOWN) for gloss in glosses])[:, 0]
-        sure = information / (information + _INFORMATION) * known * shares.amax(1)
-        compared = _compare(fitted, slope, offset, weight)
-        weight = weight * slope / square
-        pixels = torch.stack((base[:, 0], sure, (weight * offset).sum(1), *compared), dim=1)
-        return pixels.numpy(), weight.numpy()
+    geometry, roughness, metalness = sample.geometry, column(gloss.roughness), column(gloss.metalness)
+    facets = facet_lobe(geometry, roughness, column(gloss.tail))
+    of_facets = metalness * facets
+    slope = (1 - metalness) * diffuse_lobe(geometry, column(gloss.minnaert)) + of_facets
+    offset = column(gloss.level) * (1 - metalness) * facets
+    usual = column(gloss.log_base).exp() * sample.observations.amax(1, keepdim=True)
+    expected = Base(usual, _LAPLACE * column(gloss.log_base_error) * usual)
+    base, weights = fit_base(sample, slope, offset, of_facets, lobe_error(geometry, roughness), expected)
+    compared = _compare(sample, slope, offset, weights)
+    weights = weights * slope / (weights * slope**2).sum(1, keepdim=True).clamp(min=1e-12)
+    pixels = torch.stack((base[:, 0], (weights * offset).sum(1), *compared), dim=1)
+    return pixels.numpy(), weights.numpy()
 
 
 def _compare(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -302,32 +250,11 @@ def _compare(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> 
     robust fits. The share of the material that minimises the squared error is the ratio of the two sums.
     """
     cosine = sample.geometry.n_dot_l.clamp(min=0)
-    none = torch.zeros(1)
-    _, base, matte_weights = fit_base(sample, cosine, 0 * cosine, none, none, torch.zeros(1, 1, 1))
-    matte = predict_left_out(sample, cosine, 0 * cosine, matte_weights[:, 0])
-    difference = (predict_left_out(sample, slope, offset, weights) - matte) * sample.seen
+    base, matte_weights = fit_base(sample, cosine, 0 * cosine, 0 * cosine, torch.zeros(1, 1))
+    matte = predict_left_out(sample, cosine, 0 * cosine, matte_weights)
+    difference = (predict_left_out(sample, slope, offset, weights) - matte) * sample.lit
     wrong = sample.observations.clamp(max=sample.white) - matte
     return base[:, 0], (difference * wrong).sum(1), difference.square().sum(1)
-
-
-def _shares_of_glosses(
-    mask: Bools, glosses: list[Gloss], pixels: _Pixels, bright: float
-) -> tuple[Float32Array, list[float]]:
-    """Return the share of each gloss in each pixel (P, K), smooth over the map, and the usual base of each gloss."""
-    costs = np.empty((len(pixels.normals), len(glosses)), np.float32)
-    bases = np.empty_like(costs)
-    for chosen in parts_of_pixels(len(costs)):
-        sample = pixels.take(chosen, bright)
-        for place, gloss in enumerate(glosses):
-            cost, base, _ = fit_gloss(sample, gloss)
-            costs[chosen, place], bases[chosen, place] = cost.numpy(), base.numpy()
-    costs -= costs.min(axis=1, keepdims=True)
-    owner = costs.argmin(axis=1)
-    usual = [_usual_base(bases[owner == place, place], bright) for place in range(len(glosses))]
-    for place, gloss in enumerate(glosses):
-        costs[:, place] = _SHARPNESS * _smooth(costs[:, place].clip(max=15), mask) - np.log(gloss.share)
-    shares = np.exp(costs.min(axis=1, keepdims=True) - costs)
-    return np.asarray(shares / shares.sum(axis=1, keepdims=True), np.float32), usual
 
 
 def _smooth(values: Float32Array, mask: Bools) -> Float32Array:
@@ -338,12 +265,6 @@ def _smooth(values: Float32Array, mask: Bools) -> Float32Array:
     plane[mask] = values
     covered = GaussianBlur(mask.astype(np.float32), (0, 0), _SMOOTH)[mask]
     return np.asarray(GaussianBlur(plane, (0, 0), _SMOOTH)[mask] / covered, np.float32)
-
-
-def _usual_base(bases: Float32Array, bright: float) -> float:
-    """Return the median of the bases of a gloss that are not zero."""
-    above = bases[bases > 0]
-    return float(np.median(above)) if len(above) else bright
 
 
 def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float32Array) -> Float32Array:
@@ -359,9 +280,9 @@ def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float3
     return np.asarray(np.divide(total, mean, out=np.ones_like(total), where=mean > 0))
 
 
-def _exposure(base: Float32Array, found: _Mixture) -> float:
+def _exposure(base: Float32Array, gloss: GlossMaps) -> float:
     """Return the exposure at which dielectrics reflect as they usually do and no base exceeds white."""
     white = max(float(np.quantile(base.max(axis=1), _WHITE_QUANTILE)), 1e-9)
-    total = float(found.dielectric.sum())
-    mean = float(found.dielectric @ found.level) / total if total > 0 else 0.0
+    dielectric = 1 - gloss.metalness
+    mean = float(dielectric @ gloss.level) / max(float(dielectric.sum()), 1e-9)
     return float(np.clip(mean / _DIELECTRIC, white, _MOST_EXPOSURE * white))

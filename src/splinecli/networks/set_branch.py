@@ -36,6 +36,15 @@ class CaptureContext(NamedTuple):
     layers: tuple[Summary, ...]  # one for each layer of the set branch
 
 
+class PixelTokens(NamedTuple):
+    """The tokens of P pixels, and the numbers that they are relative to; see SplineNet.encode_pixels."""
+
+    tokens: Tensor  # (P, width)
+    normal_z: Tensor  # (P, 1), of the fitted normals
+    scale: Tensor  # (P, 1), the largest observation of each pixel
+    n_lights: Tensor  # (P, 1), the number of lights
+
+
 def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
     """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in (P, F).
 

@@ -16,7 +16,7 @@ from splinecli.maths.observation_map import cell_directions, map_scale, rotate_a
 from splinecli.networks.config import NetworkConfig, fit_normals
 from splinecli.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet, PaperNENet
 from splinecli.networks.refine_net import RefineNet
-from splinecli.networks.set_branch import CaptureContext, SetBranch
+from splinecli.networks.set_branch import CaptureContext, PixelTokens, SetBranch
 
 
 class Rotation(NamedTuple):
@@ -208,6 +208,25 @@ class SplineNet(nn.Module):
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, rotation=rotation)
         return self._read_set(maps, _starting_normals(maps), 1, None)[2]
+
+    def encode_pixels(
+        self,
+        observations: Tensor,
+        light_directions: Tensor,
+        valid: Tensor | None = None,
+        *,
+        captures: int = 1,
+        context: CaptureContext | None = None,
+    ) -> tuple[PixelTokens, CaptureContext | None]:
+        """Return the tokens of the set branch for pixels, and the context of their captures.
+
+        The arguments are as in `forward` and `estimate`. Only for networks with a set branch.
+        """
+        with torch.autocast(observations.device.type, enabled=False):
+            maps = self.build_maps(observations, light_directions, valid)
+        tokens, fitted, found = self._read_set(maps, _starting_normals(maps), captures, context)
+        count = torch.full_like(maps.scale, observations.shape[1]) if valid is None else valid.sum(1, keepdim=True)
+        return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count.to(maps.scale)), found
 
     def _read_set(
         self, maps: PixelMaps, normals: Tensor, captures: int, context: CaptureContext | None

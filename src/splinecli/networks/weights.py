@@ -36,11 +36,13 @@ from splinecli.errors import InputError, ModelError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_ne_net import CaptureHead
 from splinecli.networks.light_net import LightNet
+from splinecli.networks.material_net import MaterialNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.system.files import check_file, expanded, file_sha256, is_special, parse_json, utf8_name, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
+MATERIAL_FORMAT = "splinecli-material-net-1"
 LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
 LONGEST = 500_000_000  # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
 _LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
@@ -179,7 +181,8 @@ def manifest() -> dict[str, dict[str, Any]]:
     """Return the entries of assets/weights.json, which describe the shipped weights, by name.
 
     Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training. Some
-    have `capture_head`, the `file` and `sha256` of the head that adjusts the confidence using the whole capture.
+    have `capture_head`, the `file` and `sha256` of the head that adjusts the confidence using the whole capture, and
+    `material_net`, those of the net that predicts materials from the tokens of their set branch.
     """
     entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
@@ -214,10 +217,21 @@ def capture_head(sha256: str) -> CaptureHead | None:
     """Load the capture head for weights with this checksum, or None if they have none. Raises ModelError."""
     for entry in manifest().values():
         if entry["sha256"] == sha256 and "capture_head" in entry:
-            with resources.as_file(SHIPPED / entry["capture_head"]["file"]) as path:
-                _check_shipped(path, entry["capture_head"]["sha256"], path.stem)
-                return _load_module(CaptureHead(), path, HEAD_FORMAT)
+            return _load_shipped(CaptureHead(), entry["capture_head"], HEAD_FORMAT)
     return None
+
+
+def material_networks() -> tuple[SplineNet, MaterialNet]:
+    """Load spline-net, whose tokens describe materials, and the material net. Raises ModelError."""
+    shipped = manifest()["spline-net"]["material_net"]
+    return resolve_weights("spline-net").network, _load_shipped(MaterialNet(), shipped, MATERIAL_FORMAT).float().eval()
+
+
+def _load_shipped(module: Module, entry: dict[str, str], expected_format: str) -> Module:
+    """Return the module with the parameters of an entry of weights.json. Raises ModelError."""
+    with resources.as_file(SHIPPED / entry["file"]) as path:
+        _check_shipped(path, entry["sha256"], path.stem)
+        return _load_module(module, path, expected_format)
 
 
 @cache

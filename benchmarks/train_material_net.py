@@ -1,0 +1,165 @@
+"""Draw pixels for the material net and train it: how assets/material-net.safetensors was made.
+
+    python benchmarks/train_material_net.py draw FOLDER --shards 24
+    python benchmarks/train_material_net.py train FOLDER [--steps 8000] [--ship]
+
+Both go on after an interruption. The pixels are those of the training of spline-net: their materials and faults are
+described in synthesis/. The network's tokens for them are stored, because it is not changed. A shard of 512 captures
+takes about a minute on one core and 17 MB, and 1,000 steps take half a minute.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy
+
+from splinecli.networks.material_net import Gloss, MaterialNet
+from splinecli.networks.set_branch import SAMPLE, PixelTokens
+from splinecli.networks.weights import MATERIAL_FORMAT, SHIPPED, resolve_weights, save_module
+from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig, PixelScene
+from splinecli.system.files import file_sha256
+
+BATCHES, CAPTURES = 64, 8  # of a shard, and captures of a batch
+HELD = 1  # the number of shards that training does not use
+RATE = 2e-3
+
+
+class Batch(NamedTuple):
+    """Pixels of CAPTURES captures. Pixel p belongs to capture p % CAPTURES."""
+
+    pixels: PixelTokens
+    targets: Tensor  # (P, 6): roughness, metallic, log base, log level, minnaert and tail; see Gloss
+
+
+@torch.inference_mode()
+def draw(folder: Path, shards: int) -> None:
+    """Draw the shards that the folder does not have."""
+    folder.mkdir(parents=True, exist_ok=True)
+    network = resolve_weights("spline-net").network
+    for index in range(shards):
+        path = folder / f"{index:03d}.safetensors"
+        if path.exists():
+            continue
+        drawn = PixelGenerator(PixelGeneratorConfig(capture_pixels=SAMPLE), torch.Generator().manual_seed(9000 + index))
+        rows: list[tuple[Tensor, ...]] = []
+        for _ in range(BATCHES):
+            batch = drawn.draw(CAPTURES * SAMPLE)
+            with torch.autocast("cpu", torch.bfloat16):
+                pixels, context = network.encode_pixels(
+                    batch.observations, batch.light_directions, batch.valid, captures=CAPTURES
+                )
+            assert context is not None and isinstance(batch.truth, PixelScene)
+            own, shown = batch.truth.material, batch.exposure / pixels.scale
+            logs = [(value * shown).clamp(1e-4, 1e3).log() for value in (own.base, 0.08 * own.specular)]
+            targets = torch.cat((own.roughness, own.metallic, *logs, own.minnaert, own.tail_exponent), dim=1)
+            relative = pixels.scale / context.brightness.repeat(SAMPLE)[:, None]
+            rows.append((pixels.tokens.half(), pixels.normal_z, relative, pixels.n_lights, targets))
+        named = zip((*PixelTokens._fields, "targets"), zip(*rows, strict=True), strict=True)
+        tensors = {name: torch.stack(parts) for name, parts in named}
+        save_file(tensors, path.with_suffix(".part"))
+        path.with_suffix(".part").rename(path)
+        print(path, flush=True)
+
+
+def read(paths: list[Path]) -> list[Batch]:
+    """Read the batches of shards. The brightness of all captures is 1."""
+    found = []
+    for path in paths:
+        shard = load_file(path)
+        parts = zip(*(shard[name] for name in PixelTokens._fields), strict=True)
+        found += [Batch(PixelTokens(*part), own) for part, own in zip(parts, shard["targets"], strict=True)]
+    return found
+
+
+def forward(network: MaterialNet, batch: Batch) -> Gloss:
+    """Return the network's prediction for a batch."""
+    pixels = batch.pixels._replace(tokens=batch.pixels.tokens.float())
+    found, _ = network(pixels, torch.ones(CAPTURES))
+    return found  # type: ignore[no-any-return]
+
+
+def loss_of(found: Gloss, targets: Tensor) -> Tensor:
+    """Return the loss: absolute errors, the first two with the Laplace distributions that the network predicts."""
+    roughness, metallic, log_base, log_level, minnaert, tail = targets.unbind(dim=1)
+    wrong = (found.roughness - roughness).abs() / found.roughness_error + found.roughness_error.log()
+    base = (found.log_base - log_base).abs().clamp(max=3) / found.log_base_error + found.log_base_error.log()
+    dielectric = 0.2 * (found.log_level - log_level).abs() + 0.5 * (found.minnaert - minnaert).abs()
+    kind = binary_cross_entropy(found.metalness, metallic, reduction="none")
+    return (wrong + kind + 0.5 * base + (1 - metallic) * dielectric + 0.3 * (found.tail - tail).abs()).mean()
+
+
+def train(folder: Path, steps: int) -> MaterialNet:
+    """Train on the shards of a folder, and return the running average of the weights."""
+    torch.manual_seed(0)
+    paths = sorted(folder.glob("*.safetensors"))
+    batches, held = read(paths[HELD:]), read(paths[:HELD])
+    network, average = MaterialNet(), MaterialNet()
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-2)
+    checkpoint, first = folder / "checkpoint", 0
+    average.load_state_dict(network.state_dict())
+    if checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=True)
+        for part, name in ((network, "network"), (average, "average"), (optimiser, "optimiser")):
+            part.load_state_dict(state[name])
+        first = state["step"]
+    for step in range(first, steps):
+        rate = RATE * min(1, (step + 1) / 100) * ((1 + math.cos(math.pi * step / steps)) / 2 + 0.005)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        generator = torch.Generator().manual_seed(step)
+        batch = batches[int(torch.randint(len(batches), (), generator=generator))]
+        loss = loss_of(forward(network, batch), batch.targets)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        with torch.no_grad():
+            kept = min(0.995, step / (step + 10))
+            torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - kept)
+        if (step + 1) % 500 == 0:
+            parts = {"network": network, "average": average, "optimiser": optimiser}
+            torch.save({name: part.state_dict() for name, part in parts.items()} | {"step": step + 1}, checkpoint)
+            print(step + 1, validate(average, held), flush=True)
+    return average.eval()
+
+
+@torch.inference_mode()
+def validate(network: MaterialNet, held: list[Batch]) -> str:
+    """Return the errors on pixels that training does not use."""
+    rows = []
+    for batch in held:
+        found, true = forward(network, batch), batch.targets
+        metal = (found.metalness > 0.5) == (true[:, 1] > 0.5)
+        base = ((found.log_base - true[:, 2]).exp() - 1).abs().clamp(max=1)
+        inside = (found.roughness - true[:, 0]).abs() < found.roughness_error * math.log(2)
+        rows.append(torch.stack(((found.roughness - true[:, 0]).abs(), metal, base, inside), dim=1).mean(0))
+    roughness, metal, base, inside = torch.stack(rows).mean(0).tolist()
+    return f"roughness {roughness:.4f}, metalness right {metal:.3f}, base {base:.3f}; within median error {inside:.3f}"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("step", choices=("draw", "train"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--shards", type=int, default=24)
+    parser.add_argument("--steps", type=int, default=8_000)
+    parser.add_argument("--ship", action="store_true", help="write into the package")
+    given = parser.parse_args()
+    if given.step == "draw":
+        draw(given.folder, given.shards)
+    else:
+        path = given.folder / "material-net"
+        if given.ship:
+            path = Path(str(SHIPPED)) / "material-net.safetensors"
+        save_module(train(given.folder, given.steps), path, {"format": MATERIAL_FORMAT})
+        if given.ship:
+            manifest = Path(str(SHIPPED)) / "weights.json"
+            entries = json.loads(manifest.read_text("utf-8"))
+            entries["spline-net"]["material_net"] = {"file": path.name, "sha256": file_sha256(path)}
+            manifest.write_text(json.dumps(entries, indent=2, ensure_ascii=False) + "\n", "utf-8")
