@@ -390,6 +390,7 @@ def _make_files(
             estimate.normal_map,
             capture.mask,
             values={name: made[name] for name, row in MAPS.items() if name in made and row.caption},
+            material=made.get("material"),
             error_map_deg=estimate.error_map_deg,
             light_plot=light_plot,
         )

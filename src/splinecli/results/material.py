@@ -73,3 +73,21 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
     Red is for occlusion in glTF; it is white in the mask.
     """
     return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
+
+
+PAGE_CAPTIONS = {
+    "base_colour": "Base colour",
+    "gloss": "Reflectance at normal incidence (red), roughness (green) and metalness (blue)",
+}
+
+
+def page_pictures(material: Float32Array) -> dict[str, Picture]:
+    """Return the pictures from which the page draws a material (H, W, 7), by their names in PAGE_CAPTIONS.
+
+    The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness are linear.
+    """
+    from splinecli.materials.basis import F0_OF_SPECULAR
+
+    reflectance = encode_srgb(F0_OF_SPECULAR * material[..., 5:6])
+    linear = np.rint(255 * material[..., 3:5].clip(0, 1)).astype(np.uint8)
+    return {"base_colour": encode_srgb(material[..., :3]), "gloss": np.dstack((reflectance, linear))}
