@@ -338,11 +338,11 @@ def _make_files(
             values = make_map(row, source, estimate)
         if values is not None:
             made[row.name] = values
-    gloss = None
+    gloss = specular = None
     if "material" in made:
         facts = material_facts(made["material"], capture.mask)
         report["material"] = facts.as_dict()
-        gloss = gloss_picture(made["material"][..., 3:5], capture.mask)
+        gloss, specular = gloss_picture(made["material"][..., 3:5], capture.mask), made["material"][..., 5]
         if facts.gray:
             warning = CaptureWarning(GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone.")
             report["warnings"].append({"code": warning.code, "text": warning.text})
@@ -377,6 +377,7 @@ def _make_files(
             camera_matrix,
             colours,
             gloss,
+            specular,
             discontinuity=options.discontinuity,
             pixel_size_mm=pixel_size,
             progress=advance,
