@@ -26,7 +26,7 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
 from splinecli.results.maps import make_map, map_files
-from splinecli.results.material import material_facts
+from splinecli.results.material import material_facts, material_warnings
 
 SIZE = 48
 LIGHTS = cap_directions(12, 60, seed=4, even=True)
@@ -103,6 +103,27 @@ def test_units_and_order_of_lights():
     for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
         np.testing.assert_allclose(getattr(bright, name), getattr(plain, name), atol=1e-3)
         np.testing.assert_allclose(getattr(turned, name), getattr(plain, name), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("gloss", "codes"),
+    [
+        ({"diffuse": 0.5, "f0": 0.0, "roughness": 0.5}, ["gray_material", "roughness_undetermined"]),
+        ({"diffuse": 0.5, "f0": 0.04, "roughness": 0.85}, ["gray_material", "roughness_undetermined"]),
+        ({"diffuse": 0.5, "f0": 0.04, "roughness": 0.4}, ["gray_material"]),
+        ({"diffuse": 0.0, "f0": 0.8, "roughness": 0.4}, ["gray_material"]),
+    ],
+    ids=["matte", "rough", "plastic", "metal"],
+)
+def test_roughness_that_the_images_do_not_determine(gloss, codes):
+    found = material(ggx_sphere(LIGHTS, **gloss))
+    columns = (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
+    values = np.zeros((SIZE, SIZE, 7), np.float32)
+    values[MASK] = np.column_stack(columns)
+    warnings = material_warnings(material_facts(values, MASK))
+    assert [warning.code for warning in warnings] == codes
+    if "roughness_undetermined" in codes:
+        assert f"{np.median(found.roughness):.2f} in the median" in warnings[-1].text
 
 
 def test_confidence_is_low_where_no_highlight_could_be_observed():

@@ -10,6 +10,7 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
+from splinecli.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
 from splinecli.documents import MaterialFacts
 from splinecli.inference import lighting_on
 from splinecli.maths import Bools, Float32Array
@@ -50,11 +51,37 @@ def material_of(estimate: NormalEstimate, colours: Iterable[Float32Array] | None
     )
 
 
+_CONFIDENT, _LEAST_DETERMINED = 0.3, 0.02
+"""If a smaller share of the pixels has this confidence, the images do not determine the roughness. On rendered spheres
+with a plastic of 4 %, this is so from a roughness between 0.5 and 0.7."""
+
+
 def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
     """Return the facts that the report states about a material; gray images have equal channels."""
-    red, green, blue, *_, confidence = maps[mask].T
-    is_gray = bool((red == green).all() and (green == blue).all())
-    return MaterialFacts(gray=is_gray, mean_confidence=round(float(confidence.mean()), 4))
+    red, green, blue, roughness, *_, confidence = maps[mask].T
+    return MaterialFacts(
+        gray=bool((red == green).all() and (green == blue).all()),
+        mean_confidence=round(float(confidence.mean()), 4),
+        determined=round(float((confidence >= _CONFIDENT).mean()), 4),
+        median_roughness=round(float(np.median(roughness)), 4),
+    )
+
+
+def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
+    """Return what the images do not determine about a material."""
+    warnings = []
+    if facts.gray:
+        text = "The images are gray, so base_colour shows brightness alone."
+        warnings.append(CaptureWarning(GRAY_MATERIAL, text))
+    if facts.determined < _LEAST_DETERMINED:
+        text = (
+            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have a confidence of"
+            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain. roughness.npy has the mean"
+            f" of the values that fit, {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
+            " axis."
+        )
+        warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
+    return warnings
 
 
 def share_picture(values: Float32Array, _: Bools) -> Picture:
