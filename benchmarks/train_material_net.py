@@ -1,6 +1,6 @@
 """Draw pixels for the material net and train it: how assets/material-net.safetensors was made.
 
-    python benchmarks/train_material_net.py draw FOLDER --shards 24
+    python benchmarks/train_material_net.py draw FOLDER
     python benchmarks/train_material_net.py train FOLDER [--steps 8000] [--ship]
 
 Both go on after an interruption. The pixels are those of the training of spline-net: their materials and faults are
@@ -11,22 +11,27 @@ takes about a minute on one core and 17 MB, and 1,000 steps take half a minute.
 import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy
+from torch.nn.functional import binary_cross_entropy, normalize
 
 from splinecli.networks.material_net import Gloss, MaterialNet
 from splinecli.networks.set_branch import SAMPLE, PixelTokens
 from splinecli.networks.weights import MATERIAL_FORMAT, SHIPPED, resolve_weights, save_module
-from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig, PixelScene
+from splinecli.synthesis import draw_uniform
+from splinecli.synthesis.batches import PixelBatch
+from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.synthesis.pixels import PixelGeneratorConfig, PixelScene, draw_scene
+from splinecli.synthesis.whole_capture import photograph_captures
 from splinecli.system.files import file_sha256
 
 BATCHES, CAPTURES = 64, 8  # of a shard, and captures of a batch
-HELD = 1  # the number of shards that training does not use
+SPHERES = 24  # number of shards whose captures have the normals of spheres
 RATE = 2e-3
 
 
@@ -46,10 +51,10 @@ def draw(folder: Path, shards: int) -> None:
         path = folder / f"{index:03d}.safetensors"
         if path.exists():
             continue
-        drawn = PixelGenerator(PixelGeneratorConfig(capture_pixels=SAMPLE), torch.Generator().manual_seed(9000 + index))
+        generator = torch.Generator().manual_seed(9000 + index)
         rows: list[tuple[Tensor, ...]] = []
         for _ in range(BATCHES):
-            batch = drawn.draw(CAPTURES * SAMPLE)
+            batch = draw_batch(index >= SPHERES, generator)
             with torch.autocast("cpu", torch.bfloat16):
                 pixels, context = network.encode_pixels(
                     batch.observations, batch.light_directions, batch.valid, captures=CAPTURES
@@ -65,6 +70,35 @@ def draw(folder: Path, shards: int) -> None:
         save_file(tensors, path.with_suffix(".part"))
         path.with_suffix(".part").rename(path)
         print(path, flush=True)
+
+
+def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
+    """Draw a batch as PixelGenerator does; if they are narrow, with the normals of reliefs, plates and tilted parts.
+
+    The normals of a capture are then drawn together by a factor of 10^U(-2, 0), about a direction 0 to 60 degrees from
+    the camera axis. Whether a highlight is visible depends on them.
+    """
+    config, pixels = PixelGeneratorConfig(capture_pixels=SAMPLE), CAPTURES * SAMPLE
+    scene = draw_scene(pixels, config, generator)
+    if are_narrow:
+        polar = draw_uniform(generator, CAPTURES, 1, high=math.radians(60))
+        azimuth = draw_uniform(generator, CAPTURES, 1, high=2 * math.pi)
+        middle = torch.cat((polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()), dim=1)
+        share = 10 ** draw_uniform(generator, CAPTURES, 1, low=-2.0)
+
+        def narrow(normals: Tensor) -> Tensor:
+            captures = torch.arange(len(normals)) % CAPTURES
+            drawn = torch.lerp(middle[captures], normals, share[captures])
+            return normalize(torch.cat((drawn[:, :2], drawn[:, 2:].clamp(min=0.05)), dim=1), dim=1)
+
+        mixed = scene.mixed
+        if mixed is not None:
+            mixed = replace(mixed, normals=narrow(mixed.normals))
+        scene = replace(scene, normals=narrow(scene.normals), mixed=mixed)
+    counts = draw_light_counts(CAPTURES, config.min_lights, config.max_lights, config.usual_lights, generator)
+    directions = draw_light_directions(CAPTURES, int(counts.max()), generator).repeat(SAMPLE, 1, 1)
+    valid = torch.arange(directions.shape[1]) < counts.repeat(SAMPLE)[:, None]
+    return photograph_captures(scene, scene.radiance(directions), directions, valid, config, generator)
 
 
 def read(paths: list[Path]) -> list[Batch]:
@@ -95,10 +129,10 @@ def loss_of(found: Gloss, targets: Tensor) -> Tensor:
 
 
 def train(folder: Path, steps: int) -> MaterialNet:
-    """Train on the shards of a folder, and return the running average of the weights."""
+    """Train on the shards of a folder but the first and last, and return the running average of the weights."""
     torch.manual_seed(0)
     paths = sorted(folder.glob("*.safetensors"))
-    batches, held = read(paths[HELD:]), read(paths[:HELD])
+    batches, held = read(paths[1:-1]), read(paths[:1] + paths[-1:])
     network, average = MaterialNet(), MaterialNet()
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-2)
     checkpoint, first = folder / "checkpoint", 0
@@ -147,7 +181,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("draw", "train"))
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--shards", type=int, default=24)
+    parser.add_argument("--shards", type=int, default=48)
     parser.add_argument("--steps", type=int, default=8_000)
     parser.add_argument("--ship", action="store_true", help="write into the package")
     given = parser.parse_args()

@@ -57,7 +57,10 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     for name in {"NORMAL", "TANGENT"} & set(arrays):
         np.testing.assert_allclose(np.linalg.norm(arrays[name][:, :3], axis=1), 1, atol=1e-5)
     material = tree["materials"][part["material"]]
+    extension = material.get("extensions", {}).get("KHR_materials_specular", {})
+    assert set(material.get("extensions", {})) == set(tree.get("extensionsUsed", []))
     textures = {
+        "specular": extension.get("specularColorTexture"),
         "colour": material["pbrMetallicRoughness"].get("baseColorTexture"),
         "normal": material.get("normalTexture"),
         "gloss": material["pbrMetallicRoughness"].get("metallicRoughnessTexture"),

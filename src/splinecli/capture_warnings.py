@@ -157,6 +157,9 @@ REPEATED_IMAGES = WarningKind("repeated_images", "Two images are equal, their li
     severity="error")
 ROUGH_LIGHTS = WarningKind("rough_lights", "Refined light directions would fit much better",
     "[`--refine-lights`](infer.md#rough-directions), or measure them again")
+ROUGHNESS_UNDETERMINED = WarningKind("roughness_undetermined",
+    "With `--maps material`: highlights are too few, or normals too uncertain, to [determine the "
+    "roughness](materials.md#limits)", "Add lights, some of them near the camera axis")
 SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Expose shorter")
 UNEQUAL_INTENSITIES = WarningKind("unequal_intensities",
     "Light intensities look unequal, but the images do not determine them; or those of the file do not fit the images",

@@ -98,10 +98,12 @@ class AlignmentReport(Document):
 
 
 class MaterialFacts(Document):
-    """The material: whether the images have no colour, and the mean confidence."""
+    """The material: whether the images have no colour, and the confidence."""
 
     gray: bool
     mean_confidence: Share
+    determined: Share  # the share of the pixels whose confidence is at least 0.5
+    median_roughness: Share
 
 
 class EstimateReport(Document):

@@ -28,7 +28,7 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
 from splinecli.results.maps import make_map, map_files
-from splinecli.results.material import material_facts
+from splinecli.results.material import material_facts, material_warnings
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 SIZE = 48
@@ -135,6 +135,17 @@ def test_generated_pixels_that_training_did_not_use():
     sure = table[:, 3] > 0.8
     assert 0.05 < sure.float().mean() < 0.8
     assert table[sure, 2].mean() > 0.75
+
+
+@pytest.mark.parametrize(
+    ("confidence", "codes"), [(0.35, ["gray_material", "roughness_undetermined"]), (0.8, ["gray_material"])]
+)
+def test_roughness_that_the_images_do_not_determine(confidence, codes):
+    values = np.tile(np.array((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence), np.float32), (SIZE, SIZE, 1))
+    warnings = material_warnings(material_facts(values, MASK))
+    assert [warning.code for warning in warnings] == codes
+    if "roughness_undetermined" in codes:
+        assert "0.62 in the median" in warnings[-1].text
 
 
 def test_pictures_under_other_lights():

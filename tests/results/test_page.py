@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from browser import OpenPage
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
 from scenes import decode_rgb
+from splinecli.materials.lobes import GGX, Geometry, diffuse_lobe, facet_lobe
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
@@ -109,7 +111,9 @@ def test_large_maps_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     normals = faces[(np.arange(width) >= LONGEST_SIDE).astype(int)][None].repeat(height, 0) * mask[..., None]
     albedo = np.float32([0.5, 0.25, 0.125]) * mask[..., None]
     errors = np.where(mask, np.float32(12), np.nan)
-    page = Page(result_page(REPORT, normals, mask, values={"albedo": albedo}, error_map_deg=errors))
+    material = np.float32([0.5, 0.25, 0.125, 0.4, 0, 0.5, 1]) * mask[..., None]
+    html = result_page(REPORT, normals, mask, values={"albedo": albedo}, material=material, error_map_deg=errors)
+    page = Page(html)
     decoded = page.normals()
     assert decoded.shape == (150, LONGEST_SIDE, 3)
     assert page.facts["Size on this page"] == "1600 × 150"
@@ -120,7 +124,7 @@ def test_large_maps_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not shown[:50].any()
         assert angle_between_deg(half[shown], np.broadcast_to(face, half[shown].shape)).max() < 0.02
     shown = decoded.any(axis=2)
-    for name in ("Albedo map", "Error map"):
+    for name in ("Albedo map", "Base colour map", "Gloss map", "Error map"):
         colours = page.picture(name)[shown].astype(int)
         assert np.ptp(colours, axis=0).max() <= 1  # rounding alone, no background
 
@@ -229,3 +233,47 @@ def test_zoom_shows_a_part_of_the_same_picture(open_page: OpenPage, webgl: bool)
     smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
     # Without WebGL, the nearest pixel of the map is shown: at most 1/4 of a pixel away, where shading has this slope.
     assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
+
+
+def material_of_ball(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Painted on the left, metal on the right, rougher from the top to the bottom; as the pictures store it."""
+    down, right = np.mgrid[:SIDE, :SIDE] / SIDE
+    roughness = np.rint(255 * (0.25 + 0.5 * down)) / 255
+    reflectance = decode_transfer(encode_srgb(np.full((SIDE, SIDE), 0.04)).astype(np.float32) / 255, None)
+    base = decode_transfer(np.full((SIDE, SIDE, 3), np.float32([200, 90, 60])) / 255, None)
+    columns = roughness, (right > 0.5).astype(float), reflectance / 0.08, mask.astype(float)
+    return (np.dstack((base, *columns)) * mask[..., None]).astype(np.float32)
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_a_material_reflects_as_in_the_estimate(open_page: OpenPage, webgl: bool) -> None:
+    normals, mask = ball()
+    material = material_of_ball(mask)
+    html = result_page(REPORT, normals, mask, values={"albedo": material[..., :3]}, material=material)
+    tensor = torch.from_numpy(material[mask])
+    base, (roughness, metal, specular) = tensor[:, :3], tensor[:, 3:6, None].unbind(1)
+    lights = ((0.5, 0.4), (-0.6, -0.6))
+    pictures = views(open_page, html, [f"light={x},{y}&exposure=-1" for x, y in lights], webgl=webgl)
+    for (x, y), seen in zip(lights, pictures, strict=True):
+        light = torch.from_numpy(light_at(x, y)[None].astype(np.float32))
+        geometry = Geometry.of(torch.from_numpy(normals[mask]), light, torch.zeros(len(tensor)))
+        facets = facet_lobe(geometry, roughness, torch.full_like(roughness, GGX))
+        painted = base * diffuse_lobe(geometry, torch.ones(1, 1)) + 0.08 * specular * facets
+        expected = np.zeros((SIDE, SIDE, 3))
+        expected[mask] = encode_srgb(0.5 * torch.lerp(painted, base * facets, metal).numpy())
+        inner = mask & (normals[..., 2] > 0.2)  # at the outline, 13 bits of a normal are too few for a sharp highlight
+        assert np.abs(seen - expected)[inner].max() <= 3
+    assert pictures[0][mask].max() == 255  # the highlight of the metal
+
+
+def test_controls_of_a_page_with_a_material(open_page: OpenPage) -> None:
+    normals, mask = ball(40)
+    material = np.full((40, 40, 7), np.float32(0.25)) * mask[..., None]
+    page = open_page(result_page(REPORT, normals, mask, material=material))
+    page.evaluate("splinecli.ready")
+    assert page.locator("#exposure").input_value() == "2"  # a base colour of 0.25 is shown as white
+    assert page.locator("output[for=exposure]").text_content() == "2.0"
+    assert page.locator("#gain").count() == 0
+    assert page.locator("#shininess").is_disabled()
+    page.locator("input[value=specular]").check()
+    assert page.locator("#shininess").is_enabled()

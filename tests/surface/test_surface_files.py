@@ -1,6 +1,7 @@
 """Files of surfaces: meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
 
 from glb_file import read_glb
 from splinecli.errors import InputError
+from splinecli.maths.transfer import decode_transfer
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 from splinecli.surface.surface_files import GRAY, Surface, encode_surface
 
@@ -89,6 +92,47 @@ def test_glb(coloured: bool) -> None:
         assert matte["baseColorFactor"] == pytest.approx([GRAY / 255] * 3 + [1])
     [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     assert len(read.faces) == len(mesh.triangles)
+
+
+def glossy(specular: NDArray[np.floating]) -> SurfaceMesh:
+    gloss = np.dstack((np.full(SHAPE, 255), np.full(SHAPE, 102), np.zeros(SHAPE))).astype(np.uint8)
+    return replace(wave(), gloss=gloss, specular=np.broadcast_to(specular, SHAPE).astype(np.float32))
+
+
+def test_reflectance_of_glb() -> None:
+    """KHR_materials_specular has 0.04 times its colour as reflectance, and trimesh reads the rest as before."""
+    specular = np.linspace(0.1, 1.6, SHAPE[1])  # 0.8 % to 12.8 %
+    content = encode(glossy(specular), "glb")["mesh.glb"]
+    tree, arrays = read_glb(content)
+    extension = tree["materials"][0]["extensions"]["KHR_materials_specular"]
+    colour = decode_transfer(arrays["specular"].astype(np.float32) / 255, None) * extension["specularColorFactor"]
+    np.testing.assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
+    np.testing.assert_array_equal(arrays["colour"], COLOURS)
+    assert (arrays["gloss"] == (255, 102, 0)).all()
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    np.testing.assert_array_equal(np.asarray(read.visual.material.baseColorTexture), COLOURS)
+    for usual in (None, np.float32(0.5)):
+        tree, _ = read_glb(encode(replace(glossy(np.float32(1)), specular=usual), "glb")["mesh.glb"])
+        assert "extensions" not in tree["materials"][0]
+    tree, arrays = read_glb(encode(glossy(np.float32(0.25)), "glb")["mesh.glb"])
+    assert tree["materials"][0]["extensions"]["KHR_materials_specular"] == {"specularColorFactor": [0.5] * 3}
+
+
+def test_gloss_of_obj(tmp_path: Path) -> None:
+    files = encode(glossy(np.float32(0.5)), "obj")
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    lines = dict(line.split(maxsplit=1) for line in files["mesh.mtl"].decode().splitlines() if " " in line)
+    assert {key: lines[key] for key in ("map_Kd", "map_Pr", "map_Pm")} == {
+        "map_Kd": "mesh.png", "map_Pr": "mesh_roughness.png", "map_Pm": "mesh_metalness.png"
+    }  # fmt: skip
+    assert (np.asarray(Image.open(tmp_path / "mesh_roughness.png")) == 102).all()
+    assert not np.asarray(Image.open(tmp_path / "mesh_metalness.png")).any()
+    # At a roughness of 0.4, facets of 4 % reflect 0.04 / (4 x 0.4^4) of a white matte surface in the mirror direction.
+    assert float(lines["Ks"].split()[0]) == pytest.approx(0.04 / (4 * 0.4**4), abs=0.003)
+    assert float(lines["Ns"]) == pytest.approx(2 / 0.4**4 - 2)
+    read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
+    np.testing.assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 
 def test_a_mesh_without_triangles() -> None:

@@ -8,9 +8,10 @@ const STILL = 4;  // pixels that a click may move
 const SLOW_MS = 30, REST_MS = 400;  // drawings that take longer are hasty until nothing has moved for this time
 
 const find = (id) => document.getElementById(id);
-const findMaps = (prefix) => Object.fromEntries(["high", "low", "albedo", "confidence"].map((name) => [name, find(prefix + name)]));
-const [gain, shininess, ambient, coloured, doubt, hold, measure] =
-  ["gain", "shininess", "ambient", "coloured", "doubt", "hold", "measure"].map(find);
+const PICTURES = { high: "high", low: "low", albedo: MATERIAL ? "base_colour" : "albedo", confidence: "confidence", gloss: "gloss" };
+const findMaps = (prefix) => Object.fromEntries(Object.entries(PICTURES).map(([name, id]) => [name, find(prefix + id)]));
+const [exposure, gain, shininess, ambient, coloured, doubt, hold, measure] =
+  ["exposure", "gain", "shininess", "ambient", "coloured", "doubt", "hold", "measure"].map(find);
 const views = [...document.querySelectorAll("input[name=view]")], ruler = find("ruler");
 const pointers = new Map();  // the fingers or the button that are down: their last places on the screen
 let canvas = find("view"), maps = findMaps("first-"), drawing = null, awaited = false, slow = true, rest = 0, wholeDrawn;
@@ -37,7 +38,7 @@ function redraw() {
 
 function drawNow(hasty) {
   const surface = {
-    view: views.find((input) => input.checked).value, gain: +gain.value, shininess: 2 ** shininess.value,
+    view: views.find((input) => input.checked).value, exposure: 2 ** (exposure?.value ?? 0), gain: +(gain?.value ?? 0), shininess: 2 ** shininess.value,
     ambient: +ambient.value, coloured: +Boolean(coloured?.checked), doubt: +Boolean(doubt?.checked),
   };
   const took = drawing.draw(region(), surface, hasty);
@@ -107,16 +108,17 @@ function showRuler() {
 }
 
 function showSettings() {
-  const texts = [[gain, (+gain.value).toFixed(2)], [ambient, (+ambient.value).toFixed(2)], [shininess, Math.round(2 ** shininess.value)]];
+  const texts = [exposure ? [exposure, (+exposure.value).toFixed(1)] : [gain, (+gain.value).toFixed(2)], [ambient, (+ambient.value).toFixed(2)], [shininess, Math.round(2 ** shininess.value)]];
   for (const [input, text] of texts) document.querySelector(`output[for=${input.id}]`).textContent = text;
   const view = views.find((input) => input.checked).value;
-  gain.disabled = view !== "shaded";  // specular enhancement has fixed shares
-  shininess.disabled = ambient.disabled = view === "normals";
+  if (gain) gain.disabled = view !== "shaded";  // specular enhancement has fixed shares
+  shininess.disabled = view === "normals" || (MATERIAL && view === "shaded");
+  ambient.disabled = view === "normals";
   redraw();
 }
 
 /**
- * Read the address: light=x,y view=shaded|specular|normals specular=gain shininess=exponent ambient=share albedo=0
+ * Read the address: light=x,y view=shaded|specular|normals specular=gain exposure=stops shininess=exponent ambient=share albedo=0
  * confidence=1 zoom=factor,x,y ruler=x,y,x,y, the last two in pixels of the map. An example:
  * page.html#light=-0.7,0.5&specular=0
  */
@@ -124,7 +126,8 @@ function readAddress() {
   const wanted = new URLSearchParams(location.hash.slice(1)), numbers = (name) => wanted.get(name).split(",").map(Number);
   for (const input of views) input.checked = input.value === wanted.get("view") || (input.checked && !wanted.has("view"));
   if (!views.some((input) => input.checked)) views[0].checked = true;
-  if (wanted.has("specular")) gain.value = wanted.get("specular");
+  if (wanted.has("exposure") && exposure) exposure.value = wanted.get("exposure");
+  if (wanted.has("specular") && gain) gain.value = wanted.get("specular");
   if (wanted.has("shininess")) shininess.value = Math.log2(wanted.get("shininess"));
   if (wanted.has("ambient")) ambient.value = wanted.get("ambient");
   if (wanted.has("albedo") && coloured) coloured.checked = wanted.get("albedo") !== "0";
@@ -223,7 +226,7 @@ function start() {
   for (const type of ["pointerup", "pointercancel"]) surface.addEventListener(type, release);
   surface.addEventListener("wheel", turnWheel, { passive: false });
   surface.addEventListener("keydown", pressKey);
-  for (const input of [gain, shininess, ambient, coloured, doubt, ...views]) input?.addEventListener("input", showSettings);
+  for (const input of [exposure, gain, shininess, ambient, coloured, doubt, ...views]) input?.addEventListener("input", showSettings);
   measure.addEventListener("input", () => {
     ends = null;
     redraw();

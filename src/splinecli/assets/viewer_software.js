@@ -3,10 +3,10 @@ const SOFTWARE_SIDE = 400;  // pixels
 
 function inSoftware() {
   const context = canvas.getContext("2d", { alpha: false });
-  let high, low, albedo, confidence, across, down;  // the maps and their size
+  let high, low, albedo, confidence, gloss, across, down;  // the maps and their size
   function load() {
     [across, down] = [maps.high.naturalWidth, maps.high.naturalHeight];
-    [high, low, albedo, confidence] = Object.values(maps).map((image) => {
+    [high, low, albedo, confidence, gloss] = Object.values(maps).map((image) => {
       if (!image) return null;
       const whole = Object.assign(document.createElement("canvas"), { width: across, height: down }).getContext("2d");
       whole.drawImage(image, 0, 0);
@@ -19,6 +19,7 @@ function inSoftware() {
   const linear = Float32Array.from({ length: 256 }, (_, level) => decode(level / 255));
   const stored = Uint8Array.from({ length: 4096 }, (_, share) => Math.round(255 * encode(share / 4095)));
   const normal = [0, 0, 0];
+  const smith = (cosine, square) => 1 / (cosine + Math.sqrt(square + (1 - square) * cosine * cosine));
   function draw(part, surface) {
     const share = Math.min(1, SOFTWARE_SIDE / Math.max(canvas.clientWidth, canvas.clientHeight));
     const [columns, rows] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * share)));
@@ -36,14 +37,24 @@ function inSoftware() {
         const cosine = Math.max(normal[0] * x + normal[1] * y + normal[2] * z, 0);
         const peak = (Math.max(normal[0] * x + normal[1] * y + normal[2] * (z + 1), 0) / length) ** surface.shininess;
         const doubt = confidence ? surface.doubt * STRONGEST_DOUBT * (1 - confidence[from] / 255) : 0;
+        let diffuse, lobe, metal;  // of the BRDF, which the other viewer explains
+        if (MATERIAL) {
+          const facing = Math.max(normal[2], LEAST_Z), half = (1 + z) / 2, grazing = (half - 1) / 2;
+          const aligned = Math.min(Math.max((normal[0] * x + normal[1] * y + normal[2] * z + facing) / (2 * Math.sqrt(half)), 0), 1);
+          const square = Math.max((gloss[from + 1] / 255) ** 4, 1e-4);
+          lobe = square / (aligned * aligned * (square - 1) + 1) ** 2 * smith(cosine, square) * smith(facing, square);
+          diffuse = (1 + grazing * (1 - cosine) ** 5) * (1 + grazing * (1 - facing) ** 5);
+          metal = gloss[from + 2] / 255;
+        }
         for (let c = 0; c < 3; c++) {
           const base = surface.coloured && albedo ? linear[albedo[from + c]] : 1;
           let value;
           if (surface.view === "normals") value = decode((normal[c] + 1) / 2);
           else {
             value = surface.view === "specular" ? DIFFUSE_SHARE * base * cosine + SPECULAR_SHARE * peak
+              : MATERIAL ? cosine * ((base * diffuse + linear[gloss[from]] * lobe) * (1 - metal) + base * lobe * metal)
               : (base * (1 - surface.gain) + (surface.shininess + 8) / 8 * peak * surface.gain) * cosine;
-            value += (base * (1 + normal[2]) / 2 - value) * surface.ambient;
+            value = surface.exposure * (value + (base * (1 + normal[2]) / 2 - value) * surface.ambient);
           }
           value += (DOUBTFUL[c] - value) * doubt;
           picture.data[to + c] = stored[Math.round(4095 * Math.max(0, Math.min(value, 1)))];

@@ -1,10 +1,12 @@
 // Drawing with WebGL. Two pictures store the normals: the normal map has the upper 8 bits of each component, a hidden
 // picture the bits below. A component is (LOW_SCALE * high + low) / LARGEST_CODE * 2 - 1.
 const LOW_SCALE = {{ low_scale }}, LARGEST_CODE = {{ largest_code }};
+const MATERIAL = {{ "true" if maps.gloss is defined else "false" }};  // whether the page has the maps of a material
 const VIEWS = ["shaded", "specular", "normals"];
 const MOST_SAMPLES = 8;  // along a side of a pixel of the screen
 const HASTY_SIDE = 400;  // pixels of the longer side of a hasty drawing
 const DIFFUSE_SHARE = 0.4, SPECULAR_SHARE = 0.7;  // of specular enhancement
+const LEAST_Z = 0.05;  // of a normal in the BRDF
 const DOUBTFUL = [0.9, 0.25, 0.1], STRONGEST_DOUBT = 0.8;  // linear RGB of the overlay; its share where confidence is 0
 const VERTEX = `
 attribute vec2 corner;
@@ -16,36 +18,50 @@ void main() {
 }`;
 const FRAGMENT = `
 precision highp float;
-uniform sampler2D high, low, albedo, confidence;
+uniform sampler2D high, low, albedo, confidence, gloss;
 uniform vec2 size, pixel;  // of the map, and of a pixel of the screen, in pixels of the map
 uniform vec3 light;
-uniform float gain, shininess, ambient, coloured, doubt;
+uniform float gain, shininess, ambient, coloured, doubt, exposure;
 uniform int kind, samples;  // samples along a side of a pixel of the screen, 0 to interpolate
 varying vec2 place;
 
 vec3 decode(vec3 s) { return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s)); }
 vec3 encode(vec3 v) { return mix(12.92 * v, 1.055 * pow(v, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, v)); }
 
-// Add a pixel of the map with a weight: its normal, and its albedo and confidence.
-void gather(vec2 texel, float weight, inout vec4 normal, inout vec4 base) {
+// Add a pixel of the map with a weight: its normal, its albedo and confidence, its reflectance, roughness and metalness.
+void gather(vec2 texel, float weight, inout vec4 normal, inout vec4 base, inout vec3 facets) {
   vec2 at = (clamp(texel, vec2(0.0), size - 1.0) + 0.5) / size;
   vec3 upper = floor(texture2D(high, at).rgb * 255.0 + 0.5), lower = floor(texture2D(low, at).rgb * 255.0 + 0.5);
   if (upper == vec3(0.0)) return;  // outside the mask
   normal += weight * vec4((upper * float(${LOW_SCALE}) + lower) / float(${LARGEST_CODE}) * 2.0 - 1.0, 1.0);
   base += weight * vec4(decode(texture2D(albedo, at).rgb), texture2D(confidence, at).r);
+  vec3 stored = texture2D(gloss, at).rgb;
+  facets += weight * vec3(decode(stored).r, stored.gb);
 }
 
-vec3 shade(vec3 n, vec3 base) {
+float smith(float cosine, float square) { return 1.0 / (cosine + sqrt(square + (1.0 - square) * cosine * cosine)); }
+
+// The BRDF of the estimate, GGX facets above diffuse light, times pi n.l (synthesis/principled.py).
+vec3 reflected(vec3 n, vec3 base, vec3 facets) {
+  float lit = max(dot(n, light), 0.0), z = max(n.z, float(${LEAST_Z})), half2 = (1.0 + light.z) / 2.0;
+  float peak = clamp((dot(n, light) + z) / (2.0 * sqrt(half2)), 0.0, 1.0), square = max(pow(facets.g, 4.0), 1e-4);
+  float spread = peak * peak * (square - 1.0) + 1.0, grazing = (half2 - 1.0) / 2.0;
+  float lobe = square / (spread * spread) * smith(lit, square) * smith(z, square);
+  float diffuse = (1.0 + grazing * pow(1.0 - lit, 5.0)) * (1.0 + grazing * pow(1.0 - z, 5.0));
+  return lit * mix(base * diffuse + facets.r * lobe, base * lobe, facets.b);
+}
+
+vec3 shade(vec3 n, vec3 base, vec3 facets) {
   if (kind == 2) return decode((n + 1.0) / 2.0);
   float cosine = max(dot(n, light), 0.0);
   float peak = pow(max(dot(n, normalize(light + vec3(0.0, 0.0, 1.0))), 0.0), shininess);  // Blinn-Phong
   vec3 direct = kind == 1 ? float(${DIFFUSE_SHARE}) * base * cosine + float(${SPECULAR_SHARE}) * peak
-    : mix(base, vec3((shininess + 8.0) / 8.0 * peak), gain) * cosine;
-  return mix(direct, base * (1.0 + n.z) / 2.0, ambient);  // the light of an even sky around the camera
+    : ${MATERIAL ? "reflected(n, base, facets)" : "mix(base, vec3((shininess + 8.0) / 8.0 * peak), gain) * cosine"};
+  return exposure * mix(direct, base * (1.0 + n.z) / 2.0, ambient);  // the light of an even sky around the camera
 }
 
-vec3 seen(vec4 normal, vec4 base) {
-  vec3 colour = shade(normalize(normal.xyz), mix(vec3(1.0), base.rgb / normal.w, coloured));
+vec3 seen(vec4 normal, vec4 base, vec3 facets) {
+  vec3 colour = shade(normalize(normal.xyz), mix(vec3(1.0), base.rgb / normal.w, coloured), facets / normal.w);
   colour = mix(colour, vec3(${DOUBTFUL}), doubt * float(${STRONGEST_DOUBT}) * (1.0 - base.a / normal.w));
   return clamp(colour, 0.0, 1.0) * normal.w;  // at the outline, the share of the pixel that is covered
 }
@@ -56,19 +72,21 @@ void main() {
     // The shader interpolates normals itself: the sampler would interpolate the upper and the lower bits separately.
     vec2 first = floor(place - 0.5), part = place - 0.5 - first;
     vec4 normal = vec4(0.0), base = vec4(0.0);
-    gather(first, (1.0 - part.x) * (1.0 - part.y), normal, base);
-    gather(first + vec2(1.0, 0.0), part.x * (1.0 - part.y), normal, base);
-    gather(first + vec2(0.0, 1.0), (1.0 - part.x) * part.y, normal, base);
-    gather(first + vec2(1.0, 1.0), part.x * part.y, normal, base);
-    if (normal.w > 0.001) sum = seen(normal, base);
+    vec3 facets = vec3(0.0);
+    gather(first, (1.0 - part.x) * (1.0 - part.y), normal, base, facets);
+    gather(first + vec2(1.0, 0.0), part.x * (1.0 - part.y), normal, base, facets);
+    gather(first + vec2(0.0, 1.0), (1.0 - part.x) * part.y, normal, base, facets);
+    gather(first + vec2(1.0, 1.0), part.x * part.y, normal, base, facets);
+    if (normal.w > 0.001) sum = seen(normal, base, facets);
   } else {
     // A smaller view is a reduced picture, not one of reduced normals.
     for (int i = 0; i < ${MOST_SAMPLES ** 2}; i++) {
       if (i >= samples * samples) break;
       vec2 at = (vec2(mod(float(i), float(samples)), floor(float(i) / float(samples))) + 0.5) / float(samples) - 0.5;
       vec4 normal = vec4(0.0), base = vec4(0.0);
-      gather(floor(place + at * pixel), 1.0, normal, base);
-      if (normal.w > 0.0) sum += seen(normal, base);
+      vec3 facets = vec3(0.0);
+      gather(floor(place + at * pixel), 1.0, normal, base, facets);
+      if (normal.w > 0.0) sum += seen(normal, base, facets);
     }
     sum /= float(samples * samples);
   }
@@ -133,7 +151,7 @@ function withWebGL() {
     gl.uniform1i(place("samples"), hasty ? 1 : samples);
     gl.uniform3f(place("light"), ...light);
     gl.uniform1i(place("kind"), VIEWS.indexOf(surface.view));
-    for (const name of ["gain", "shininess", "ambient", "coloured", "doubt"]) gl.uniform1f(place(name), surface[name]);
+    for (const name of ["gain", "shininess", "ambient", "coloured", "doubt", "exposure"]) gl.uniform1f(place(name), surface[name]);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     if (!hasty) gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, last);  // waits for the drawing
     return performance.now() - began;

@@ -23,7 +23,6 @@ from splinecli.capture.formats.images import check_memory
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
 from splinecli.capture_warnings import (
     EIGHT_BIT,
-    GRAY_MATERIAL,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
     UNTRAINED_LIGHTS,
@@ -45,7 +44,7 @@ from splinecli.pipeline.integrate import make_surface, view_of_report
 from splinecli.results import files
 from splinecli.results.files import report_of
 from splinecli.results.maps import chosen_maps, make_map, map_files, map_picture
-from splinecli.results.material import base_colour_picture, gloss_picture, material_facts
+from splinecli.results.material import base_colour_picture, gloss_picture, material_facts, material_warnings
 from splinecli.results.pages import result_page
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
@@ -338,13 +337,12 @@ def _make_files(
             values = make_map(row, source, estimate)
         if values is not None:
             made[row.name] = values
-    gloss = None
+    gloss = specular = None
     if "material" in made:
         facts = material_facts(made["material"], capture.mask)
         report["material"] = facts.as_dict()
-        gloss = gloss_picture(made["material"][..., 3:5], capture.mask)
-        if facts.gray:
-            warning = CaptureWarning(GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone.")
+        gloss, specular = gloss_picture(made["material"][..., 3:5], capture.mask), made["material"][..., 5]
+        for warning in material_warnings(facts):
             report["warnings"].append({"code": warning.code, "text": warning.text})
             observer.warn(f"{capture.name}: {warning}")
     scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
@@ -377,6 +375,7 @@ def _make_files(
             camera_matrix,
             colours,
             gloss,
+            specular,
             discontinuity=options.discontinuity,
             pixel_size_mm=pixel_size,
             progress=advance,
@@ -390,6 +389,7 @@ def _make_files(
             estimate.normal_map,
             capture.mask,
             values={name: made[name] for name, row in MAPS.items() if name in made and row.caption},
+            material=made.get("material"),
             error_map_deg=estimate.error_map_deg,
             light_plot=light_plot,
         )

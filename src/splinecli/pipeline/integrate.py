@@ -53,6 +53,7 @@ def make_surface(
     camera_matrix: NDArray[np.floating] | None = None,
     colours: NDArray[np.uint8] | None = None,
     gloss: NDArray[np.uint8] | None = None,
+    specular: NDArray[np.float32] | None = None,
     *,
     discontinuity: float = DISCONTINUITY,
     largest_step: float | None = None,
@@ -67,12 +68,12 @@ def make_surface(
     """Return the surface of a normal map, and its entry in the reports.
 
     The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. `gloss` (H, W, 3)
-    is glTF's texture of roughness and metalness; with None, the mesh is matte. Without
-    `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on the object and gives a
-    surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean depth. The prior is in
-    the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is not needed. `level` is
-    as in plane_slopes, or None; like a height of the pixels other than their width, it raises UsageError with a camera
-    matrix.
+    is glTF's texture of roughness and metalness; with None, the mesh is matte. `specular` (H, W) is 0.5 for a
+    reflectance of 4 %. Without `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on
+    the object and gives a surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean
+    depth. The prior is in the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is
+    not needed. `level` is as in plane_slopes, or None; like a height of the pixels other than their width, it raises
+    UsageError with a camera matrix.
     """
     if camera_matrix is not None and (level is not None or pixel_aspect != 1):
         option = "--pixel-aspect" if level is None else "--level"
@@ -103,6 +104,8 @@ def make_surface(
         mesh = replace(mesh, vertices=mesh.vertices * np.array((1, pixel_aspect, 1), np.float32))
     if gloss is not None:
         mesh = replace(mesh, gloss=fill_outside(gloss, mask))
+    if specular is not None:
+        mesh = replace(mesh, specular=fill_outside(specular, mask))
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit: Unit = "pixel" if camera_matrix is None else "mean depth"
     millimetres = 1 / pixel
@@ -194,13 +197,17 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     prior = None
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
-    of_material = [options.normals / MAPS["material"].files[name] for name in ("base_colour.png", GLOSS)]
+    names = ("base_colour.png", GLOSS, "specular.npy")
+    of_material = [options.normals / MAPS["material"].files[name] for name in names]
     has_material = all(path.is_file() for path in of_material)
-    picture, gloss = options.colours, None
+    picture, gloss, specular = options.colours, None, None
     of_folder = of_material[0] if has_material else options.normals / MAPS["albedo"].files["png"]
     if picture is None and of_folder.is_file():
         picture = of_folder
-        gloss = _read_picture(of_material[1], mask.shape) if has_material else None
+        if has_material:
+            gloss = _read_picture(of_material[1], mask.shape)
+            stored = read_depth(of_material[2], ExpectedSize(mask.shape, "the normal map", "a map"))
+            specular = np.nan_to_num(stored).clip(0, 12.5).astype(np.float32)  # up to full reflection
     colours = None if picture is None else _read_picture(picture, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
         surface, found = make_surface(
@@ -209,6 +216,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             camera_matrix,
             colours,
             gloss,
+            specular,
             discontinuity=discontinuity,
             largest_step=options.largest_step,
             n_triangles=options.decimate,

@@ -10,6 +10,7 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
+from splinecli.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
 from splinecli.documents import MaterialFacts
 from splinecli.inference import lighting_on
 from splinecli.maths import Bools, Float32Array
@@ -50,11 +51,36 @@ def material_of(estimate: NormalEstimate, colours: Iterable[Float32Array] | None
     )
 
 
+_CONFIDENT, _LEAST_DETERMINED = 0.5, 0.1
+"""If a smaller share of the pixels has this confidence, the images do not determine the roughness."""
+
+
 def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
     """Return the facts that the report states about a material; gray images have equal channels."""
-    red, green, blue, *_, confidence = maps[mask].T
-    is_gray = bool((red == green).all() and (green == blue).all())
-    return MaterialFacts(gray=is_gray, mean_confidence=round(float(confidence.mean()), 4))
+    red, green, blue, roughness, *_, confidence = maps[mask].T
+    return MaterialFacts(
+        gray=bool((red == green).all() and (green == blue).all()),
+        mean_confidence=round(float(confidence.mean()), 4),
+        determined=round(float((confidence >= _CONFIDENT).mean()), 4),
+        median_roughness=round(float(np.median(roughness)), 4),
+    )
+
+
+def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
+    """Return what the images do not determine about a material."""
+    warnings = []
+    if facts.gray:
+        text = "The images are gray, so base_colour shows brightness alone."
+        warnings.append(CaptureWarning(GRAY_MATERIAL, text))
+    if facts.determined < _LEAST_DETERMINED:
+        text = (
+            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have a confidence of"
+            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain. roughness.npy has the mean"
+            f" of the values that fit, {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
+            " axis."
+        )
+        warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
+    return warnings
 
 
 def share_picture(values: Float32Array, _: Bools) -> Picture:
@@ -73,3 +99,21 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
     Red is for occlusion in glTF; it is white in the mask.
     """
     return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
+
+
+PAGE_CAPTIONS = {
+    "base_colour": "Base colour",
+    "gloss": "Reflectance at normal incidence (red), roughness (green) and metalness (blue)",
+}
+
+
+def page_pictures(material: Float32Array) -> dict[str, Picture]:
+    """Return the pictures from which the page draws a material (H, W, 7), by their names in PAGE_CAPTIONS.
+
+    The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness are linear.
+    """
+    from splinecli.materials.lobes import F0_OF_SPECULAR
+
+    reflectance = encode_srgb(F0_OF_SPECULAR * material[..., 5:6])
+    linear = np.rint(255 * material[..., 3:5].clip(0, 1)).astype(np.uint8)
+    return {"base_colour": encode_srgb(material[..., :3]), "gloss": np.dstack((reflectance, linear))}

@@ -21,6 +21,7 @@ from splinecli.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, Picture, colour_errors, encode_png
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
+from splinecli.results.material import PAGE_CAPTIONS, page_pictures
 from splinecli.system.machine import is_out_of_memory
 
 
@@ -56,6 +57,7 @@ def result_page(
     mask: NDArray[np.bool_],
     *,
     values: Mapping[str, NDArray[np.float32]] | None = None,
+    material: NDArray[np.float32] | None = None,
     error_map_deg: NDArray[np.float32] | None = None,
     light_plot: bytes | None = None,
 ) -> str:
@@ -72,16 +74,23 @@ def result_page(
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
         values: (H, W) or (H, W, C), by name, for the maps in MAPS that the page shows.
+        material: (H, W, 7), see splinecli.results.material; determines how the page reflects light. None for the albedo
+            and a highlight that the reader sets.
         error_map_deg: (H, W) degrees, NaN where the error is unknown.
         light_plot: a PNG of the lights, if they were estimated from the images.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
     values = values or {}
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
-    error_png = None
+    error_png, exposure, captions = None, 0.0, {name: MAPS[name].caption for name in values}
     for name, whole in values.items():
         reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(*shown.shape, *whole.shape[2:])
         maps[name] = map_picture(MAPS[name], reduced, shown)
+    if material is not None:
+        maps |= page_pictures(_reduce(material, mask, LARGEST_MAP)[0])
+        captions |= PAGE_CAPTIONS
+        bright = float(np.quantile(material[mask][:, :3].max(axis=1), 0.99))  # is shown as white
+        exposure = round(float(-np.log2(np.clip(bright, 1 / 16, 16))), 1)
     if error_map_deg is not None:
         values_deg, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
         error_png = _data_url(colour_errors(np.where(known, values_deg[..., 0], np.nan)))
@@ -112,7 +121,8 @@ def result_page(
         largest_code=_LARGEST_CODE,
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
-        captions={name: MAPS[name].caption for name in values},
+        captions=captions,
+        exposure=exposure,
         error_map=error_png,
         light_plot=None if light_plot is None else picture_url(light_plot),
         error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
@@ -160,8 +170,8 @@ def _reduce(
         return values, known
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
-    total = cv2.resize(np.where(known[..., None], values, 0), size, interpolation=cv2.INTER_AREA)
-    total = total.reshape(*weight.shape[:2], -1)  # OpenCV drops the axis if there is only one channel
+    channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))  # OpenCV takes up to four
+    total = np.dstack([cv2.resize(channel, size, interpolation=cv2.INTER_AREA) for channel in channels])
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 

@@ -13,6 +13,7 @@ its colour is (x + 1) / 2 and so on (glTF 2.0, section 3.9.3).
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,8 @@ class SurfaceMesh:
     normal_texture: NDArray[np.uint8] | None = None
     # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a matte surface
     gloss: NDArray[np.uint8] | None = None
+    # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for that everywhere
+    specular: Float32Array | None = None
     tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
@@ -140,8 +143,8 @@ def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
 
-def fill_outside(texture: NDArray[np.uint8], known: Bools) -> NDArray[np.uint8]:
-    """Return a texture (H, W, 3) in which every pixel that is not known (H, W) has the value of the nearest known one.
+def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
+    """Return a texture (H, W) or (H, W, 3) in which unknown pixels have the value of the nearest known (H, W) one.
 
     Viewers interpolate between pixels and reduce textures, which would bring in the background at the border.
     """

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
+from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
@@ -26,18 +27,19 @@ if TYPE_CHECKING:
 SURFACE_FILES = {
     "glb": ("mesh.glb",),
     "ply": ("mesh.ply",),
-    "obj": ("mesh.obj", "mesh.mtl", "mesh.png"),
+    "obj": ("mesh.obj", "mesh.mtl", "mesh.png", "mesh_roughness.png", "mesh_metalness.png"),
     "stl": ("mesh.stl",),
     "npy": ("depth.npy",),
     "tiff": ("depth.tiff",),
     "png": ("depth.png",),
     "exr": ("depth.exr",),
 }
-"""The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
+"""The file names of each format; the pictures are the textures of an OBJ file, if there are colours and a gloss."""
 
 LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = "level_normals.npy", "level_normals.png"  # of `integrate --level`
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 DEFAULT_FORMATS = ("glb", "ply", "npy", "tiff", "png")
+USUAL_SPECULAR = 0.5  # of glTF: a reflectance of 4 %
 GRAY = 204  # colour of a mesh without a texture, of 255
 
 
@@ -80,8 +82,10 @@ def _encode_glb(surface: Surface) -> bytes:
     if not len(mesh.triangles):
         raise no_triangles()
 
-    def add_tangents(buffers: Any, tree: Any) -> None:
-        """Add the tangents to a glTF file. Without them, viewers derive their own tangents in different ways."""
+    def add_rest(buffers: Any, tree: Any) -> None:
+        """Add what trimesh lacks. Without the tangents, viewers derive their own tangents in different ways."""
+        if mesh.specular is not None:
+            _add_specular(buffers, tree, mesh.specular)
         if mesh.tangents is None:
             return
         for part in (part for shape in tree["meshes"] for part in shape["primitives"]):
@@ -105,10 +109,33 @@ def _encode_glb(surface: Surface) -> bytes:
         **{name: Image.fromarray(picture) for name, picture in textures.items() if picture is not None},
     )
     shown = _trimesh(mesh, _textured(mesh, material), surface.millimetres / 1000)
-    glb: bytes = trimesh.exchange.gltf.export_glb(
-        shown.scene(), include_normals=True, buffer_postprocessor=add_tangents
-    )
+    glb: bytes = trimesh.exchange.gltf.export_glb(shown.scene(), include_normals=True, buffer_postprocessor=add_rest)
     return glb
+
+
+def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> None:
+    """Add KHR_materials_specular to a glTF file of one material: the reflectance (H, W) relative to the usual one."""
+    relative = specular / USUAL_SPECULAR
+    largest = float(relative.max())
+    if np.abs(relative - 1).max() < 0.01:
+        return
+    added: dict[str, Any] = {"specularColorFactor": [largest] * 3}
+    if np.ptp(relative) > 0.01 * largest:
+        added["specularColorTexture"] = {"index": len(tree["textures"])}
+        tree["textures"].append({"source": len(tree["images"])})
+        tree["images"].append({"bufferView": len(buffers), "mimeType": "image/png"})
+        png = _encode_texture(np.repeat(encode_srgb(relative / largest)[..., None], 3, axis=2))
+        buffers["specular"] = png + bytes(-len(png) % 4)
+    tree["materials"][0]["extensions"] = {"KHR_materials_specular": added}
+    tree["extensionsUsed"] = ["KHR_materials_specular"]
+
+
+def _encode_texture(picture: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
 
 
 def _encode_ply(surface: Surface) -> bytes:
@@ -122,14 +149,27 @@ def _encode_ply(surface: Surface) -> bytes:
 
 
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
-    """Encode OBJ with normals, texture coordinates and, with colours, a texture. A comment has the unit's name."""
+    """Encode OBJ with normals, texture coordinates and, with colours, textures. A comment has the unit's name.
+
+    With a gloss, the material has the maps of the extension for physically-based rendering, and Phong's highlight of
+    the same height and about the same width for programs that do not read these maps.
+    """
     import trimesh
     from PIL import Image
 
     mesh = surface.mesh
     image = None if mesh.texture is None else Image.fromarray(mesh.texture)
     diffuse = (GRAY if image is None else 255,) * 3
-    material = trimesh.visual.material.SimpleMaterial(image, diffuse, specular=(0, 0, 0), name="mesh")
+    reflectance, shininess = 0.0, 1.0
+    if mesh.gloss is not None and mesh.texture is not None:
+        roughness, metalness = np.moveaxis(mesh.gloss[..., 1:] / 255, 2, 0)
+        specular = USUAL_SPECULAR if mesh.specular is None else mesh.specular
+        base = decode_transfer(mesh.texture.mean(axis=2) / 255, None)
+        square = max(float(roughness.mean()) ** 4, 1e-3)  # of the width of the facets' slopes
+        reflectance = float((0.08 * specular * (1 - metalness) + base * metalness).mean()) / (4 * square)
+        shininess = 2 / square - 2
+    gray = (round(255 * min(reflectance, 1.0)),) * 3
+    material = trimesh.visual.material.SimpleMaterial(image, diffuse, specular=gray, glossiness=shininess, name="mesh")
     text, files = trimesh.exchange.obj.export_obj(
         _trimesh(mesh, _textured(mesh, material)),
         include_normals=True,
@@ -137,6 +177,10 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
         mtl_name="mesh.mtl",
         header=f"unit: {surface.unit}",
     )
+    if mesh.gloss is not None:
+        for place, (name, key) in enumerate((("mesh_roughness.png", "map_Pr"), ("mesh_metalness.png", "map_Pm")), 1):
+            files["mesh.mtl"] += f"\n{key} {name}".encode()
+            files[name] = _encode_texture(mesh.gloss[..., place])
     return {"mesh.obj": text.encode(), **files}
 
 
