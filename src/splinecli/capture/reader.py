@@ -67,6 +67,12 @@ def open_capture(
         InputError: find_capture_files does not recognise the folder, a light file is wrong, or the window is not inside
             the images.
         UsageError: the white level is not a number above 0, or the object's width is given and a part is read.
+
+    Examples:
+        >>> from splinecli.capture import open_capture
+        >>> source = open_capture("examples/medallion")
+        >>> source.n_lights, source.files.images[0].name
+        (10, '01.png')
     """
     check_white_level(white_level)
     equal = intensities is not None and str(intensities) == EQUAL
@@ -173,7 +179,14 @@ def read_capture(
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:
-    """Open a capture with open_capture and read it with CaptureSource.read."""
+    """Open a capture with open_capture and read it with CaptureSource.read.
+
+    Examples:
+        >>> from splinecli.capture import read_capture
+        >>> capture = read_capture("examples/medallion", light_indices=[0, 2, 4])
+        >>> capture.observations.shape, capture.light_directions.shape
+        ((11836, 3), (3, 3))
+    """
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
     )

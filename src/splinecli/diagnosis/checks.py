@@ -263,7 +263,15 @@ CHECKS = [
 
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source; see check_sample."""
+    """Return warnings about a capture that was read from this source; see check_sample.
+
+    Examples:
+        >>> from splinecli.capture import open_capture
+        >>> from splinecli.diagnosis.checks import check_capture
+        >>> source = open_capture("examples/medallion")
+        >>> [warning.code for warning in check_capture(source, source.read())]
+        []
+    """
     samples, truth = _samples(capture), capture.ground_truth
     seen = CaptureSample.of_source(source, samples, capture.light_indices, truth=truth, strict=strict)
     return check_sample(replace(seen, estimated=capture.estimated_intensities))[1]

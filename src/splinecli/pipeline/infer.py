@@ -190,6 +190,14 @@ def infer_capture(
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from splinecli.pipeline.infer import infer_capture
+        >>> from splinecli.pipeline.infer_options import InferOptions
+        >>> report = infer_capture(Path("examples/medallion"), InferOptions(method="ls", output="results"))
+        >>> report["n_pixels"]
+        11836
     """
     name = capture_name(folder)
     with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
