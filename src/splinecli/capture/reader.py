@@ -131,7 +131,7 @@ def open_capture(
         warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
-        text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
+        text = f"{files.others[0].name}{more}: left out, because the name is not that of a photograph under one of"
         text += " the lights. To use it as one, list all images in filenames.txt."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
@@ -260,7 +260,7 @@ def _match_count(
         if found is None or int(found[1]) >= len(images):
             raise
         names = [image.name for image in images[int(found[1]) :]]
-        hint = f"In the order of the images, none is left for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        hint = f"In this order, it has none for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
         raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 

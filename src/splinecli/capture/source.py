@@ -81,7 +81,7 @@ class CaptureSource:
     light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # the near lamps of files and options, or None
     camera_matrix: Float64Array | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
-    channels: ChannelLights | None = None  # if each channel of a colour image counts as an image of its own
+    channels: ChannelLights | None = None  # if each channel of a colour image is an image of its own
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
     # JSON values that change when a file that is read for the capture, or the given white level, does. They are taken
@@ -165,7 +165,7 @@ class CaptureSource:
         observations = observations[:n_pixels]
         warnings = [*self.warnings, *warnings]
         if upside_down:
-            text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
+            text = "The rows of the ground truth are in reverse order, so the map was flipped."
             warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
         warnings += [*of_lamps, *self.mask_warnings(mask, indices)]
@@ -349,7 +349,7 @@ class CaptureSource:
     def _aligned_reader(
         self, transforms: Float64Array, mask: Bools, like: str, wanted: Integers | slice, around: Bools | None
     ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
-        """Return what pixel_reader returns, of images that are moved back as a whole."""
+        """Return a reader like pixel_reader's, of images that are moved back as a whole."""
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
         read = linearise.pixel_reader(
             self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1)

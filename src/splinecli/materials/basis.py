@@ -100,11 +100,11 @@ _LEVELS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.3)  # relativ
 _LEVEL_SHARES = (0.05, 0.06, 0.09, 0.16, 0.26, 0.2, 0.1, 0.06, 0.03, 0.02)  # how common each is: 4 % is usual
 _METALS = 0.3  # share of metals among materials
 _ROUGH, _MOST_ROUGH_LEVEL = 0.7, 0.3  # rough facets of a higher level only imitate interreflection
-"""The grid, and what is known before. The shares are about those of synthesis/principled.py."""
+"""The grid, and what is known before. The shares are about as in synthesis/principled.py."""
 
 _RELATIVE, _DEGREES_OF_FREEDOM = 0.05, 3.0
 _MOST_LOBE_ERROR = 0.6
-"""The errors of observations: a share of what is expected, with the tails of Student's distribution. A sharp lobe also
+"""The errors of observations: a share of the prediction, with the tails of Student's distribution. A sharp lobe also
 changes with the normals' errors, at most by the last share of itself."""
 
 _SHADOW_COST = 3.0  # most that an observation counts that is too dark: it may be in shadow
@@ -115,14 +115,14 @@ _NO_BASE, _NO_BASE_COST = 4.0, 2.0
 _PRIOR_OF_SAMPLE = 0.3  # of the prior of a gloss, that each pixel counts
 _LEAST_GAIN = 0.3  # of the mean cost, for a further gloss
 _LEAST_SHARE = 0.02  # of the sample, for a gloss
-_INDEPENDENT = 30.0  # pixels: more tell no more about a gloss, because they deviate from it alike
+_INDEPENDENT = 30.0  # pixels: more pixels add no information on a gloss, because their deviations are alike
 _LEVEL_STEPS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of a level that are compared
 _STEPS = 4  # of the robust fit of a base
 
 
 @dataclass(frozen=True)
 class Gloss:
-    """A material but for its base, with what is known about it."""
+    """A material without its base, with the uncertainty of its parameters."""
 
     roughness: float
     roughness_error: float  # standard deviation
@@ -138,7 +138,7 @@ class Gloss:
 
 
 class Sample(NamedTuple):
-    """Observations and what the fit knows about them."""
+    """Observations with their geometry and errors."""
 
     observations: Tensor  # (P, F)
     geometry: Geometry
@@ -209,7 +209,7 @@ def lobe_error(geometry: Geometry, roughness: float | Tensor) -> Tensor:
 def fit_gloss(sample: Sample, gloss: Gloss) -> tuple[Tensor, Tensor, Tensor]:
     """Return the costs (P,) and the bases (P,) of pixels of a gloss, and their prediction errors (P, F); see fit_base.
 
-    The error of an observation is that of the prediction from the others.
+    Each observation is predicted from the others.
     """
     one = torch.ones(1, 1)
     diffuse = diffuse_lobe(sample.geometry, gloss.minnaert * one)
@@ -223,7 +223,7 @@ def fit_gloss(sample: Sample, gloss: Gloss) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def predict_left_out(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
-    """Return what base * slope + offset, fitted to all observations (P, F) but one, predicts for this one."""
+    """Return the predictions (P, F) of base * slope + offset, each fitted to the other observations of its pixel."""
     above, below = weights * slope * (sample.observations - offset), weights * slope**2
     others = below.sum(1, keepdim=True) - below
     base = ((above.sum(1, keepdim=True) - above) / others.clamp(min=1e-12)).clamp(min=0)
@@ -260,7 +260,7 @@ def find_glosses(sample: Sample, bright: float) -> list[Gloss]:
 
 
 def _most_predictive(sample: Sample, gloss: Gloss) -> Gloss:
-    """Return a gloss with the share of its level, or none in place of a metal, that predicts observations best.
+    """Return a gloss with the share of its level, or no gloss instead of a metal, that predicts observations best.
 
     Each observation is predicted from the others. The costs tolerate a highlight in the wrong place, and a metal that
     is fitted to a few observations in shadow. A lower level gives better pictures there.

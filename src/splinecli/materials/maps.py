@@ -40,7 +40,7 @@ _SHARPNESS = 4.5  # how much the mean of so many costs counts
 _DIELECTRIC = 0.04  # mean reflectance of dielectrics at normal incidence, which determines the exposure
 _WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
 _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
-_USUAL_SPECULAR = 0.5  # of glTF, where there is no dielectric
+_USUAL_SPECULAR = 0.5  # of glTF, if there are no dielectrics
 _UNKNOWN = 0.26  # standard deviation of a roughness of which nothing is known
 _FLAT = 0.1  # of the mean observation: an error of all observations in the last fit, so that dark ones do not decide
 _WHITE = 0.999  # quantile of the observations
@@ -55,7 +55,7 @@ _MOST_CELLS = 40_000  # shadows of larger maps are computed for every second, th
 
 @dataclass(frozen=True, eq=False)
 class MaterialMaps:
-    """The material of the P pixels of a mask, in glTF's parameters, and what pictures of it need in addition.
+    """The material of the P pixels of a mask, in glTF's parameters, and further values for pictures.
 
     base_colour: (P, 3) linear RGB; all channels are equal for gray images. The exposure of photographs is unknown, so
         the scale is chosen such that dielectrics reflect 4 % on average, but never so that the brightest bases exceed
@@ -181,7 +181,7 @@ def render_gray(
 def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
     """Return which distant lights (F, 3) reach the P pixels of the mask (H, W): (P, F), without attached shadows.
 
-    The shadows are those of the integrated normals (H, W, 3), for an orthographic camera.
+    The shadows are cast by the surface of the normals (H, W, 3), for an orthographic camera.
     """
     step = max(1, ceil(sqrt(np.count_nonzero(mask) / _MOST_CELLS)))
     coarse = mask[::step, ::step]

@@ -1,4 +1,4 @@
-"""The seconds that `infer` is expected to take for each stage of a capture: for its progress bar, and for `info`.
+"""The expected seconds of each stage of `infer` for a capture: for its progress bar, and for `info`.
 
 The costs were measured on two cores, with native bfloat16 and with AVX2 alone (benchmarks/large_captures.py). Other
 processors may differ from them by a factor of two.

@@ -57,7 +57,7 @@ def describe_capture(
                 source = align(source, None, lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-                problem = f"the plot {plot} would be in the folder of the images and count as an image of the capture"
+                problem = f"the plot {plot} would be in the folder of the images and be read as an image of the capture"
                 raise UsageError(problem, hint="Choose another folder for it")
             check_free(plot.parent, [plot.name], overwrite=options.overwrite)
         if mended_lights is not None:
@@ -148,7 +148,7 @@ def _camera_in_words(report: dict[str, Any]) -> str | None:
     if of_exif is None:
         return None
     rows = ", ".join(" ".join(f"{number:.6g}" for number in row) for row in of_exif)
-    return f"counts as orthographic; EXIF suggests a --camera-matrix with the rows {rows}"
+    return f"treated as orthographic; EXIF suggests a --camera-matrix with the rows {rows}"
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
@@ -166,7 +166,7 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
         lines.append(f"{row['reading']:{width}}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
     return [
         *lines,
-        "misfit: what the reading leaves of the images, as a share of what random orders leave; it judges orders",
+        "misfit: residual of the images, relative to lights in random order; it judges orders",
         "advantage: evidence from curl and outline, against the file as given; from 1 on it gives a warning",
     ]
 

@@ -130,7 +130,7 @@ def make_surface(
 
 
 def _stretched(normal_map: NDArray[np.float32], mask: NDArray[np.bool_], aspect: float) -> NDArray[np.float32]:
-    """Return the normals of a surface whose height per row of pixels is that of square pixels."""
+    """Return the normals of a surface that has the same heights on square pixels."""
     stretched = np.zeros_like(normal_map)
     stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))
     return stretched

@@ -1,10 +1,10 @@
 """Register images that moved between exposures, without being misled by the changing light.
 
-All images are compared with what a matte surface shows under their lights, I = l . b, so that the light's effect on the
+All images are compared with a matte surface under their lights, I = l . b, so that the light's effect on the
 images is part of the model. The transforms, and small corrections of the lights, minimise the robust residuals of this
 model jointly, by Gauss-Newton steps in which every pixel's b is eliminated (variable projection). This is the batch
 alignment of Y. Peng, A. Ganesh, J. Wright, W. Xu, Y. Ma, "RASL: Robust alignment by sparse and low-rank decomposition",
-TPAMI 2012, with the known lights in place of an unknown subspace. The images are high-pass filtered, which keeps the
+TPAMI 2012, with the known lights instead of an unknown subspace. The images are high-pass filtered, which keeps the
 model linear and removes most of the gloss. The first shifts come from correlations of the gradients of images with
 similar lights.
 """
@@ -39,7 +39,7 @@ _NEIGHBOURS = 8  # images with similar lights that each image is compared with f
 _HIGH_PASS, _LOW_PASS = 3.0, 0.7  # standard deviations in pixels
 _MOST_OBSERVATIONS = 600_000  # on a level
 _LIGHT_SIGMA, _BRIGHTNESS_SIGMA = 0.05, 0.3  # expected relative errors of the given lights
-_CORRELATED = 300.0  # neighbouring residuals are alike: so many count as one, when they are weighed against a prior
+_CORRELATED = 300.0  # neighbouring residuals are correlated: so many weigh as much as one against a prior
 _RIDGE = 0.02  # share of a pixel's weights, pulls its b to zero
 _SMALLEST_ENERGY, _CUT = 1e-3, 2.0  # of a pixel's features, and residual with half of the weight, see _Fit
 _DARK, _SHADOW_WEIGHT = 0.1, 0.05
@@ -49,7 +49,7 @@ _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by thi
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How images moved against the first of them, in pixels: x is the column, y the row.
+    """How images moved against the first one, in pixels: x is the column, y the row.
 
     transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each image.
     moved_pixels: (F,), the root mean square motion over the object.
@@ -113,7 +113,7 @@ def _described(model: Model, transforms: Float64Array, mask: Bools, fits: Float6
 
 
 def common_pixels(transforms: Float64Array, shape: Sequence[int]) -> Bools:
-    """Return which pixels (H, W) of the reference lie inside all images of this shape (H, W)."""
+    """Return which pixels (H, W) of the reference are inside all images of this shape (H, W)."""
     height, width = shape
     rows, columns = np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)
     common = np.ones((height, width), np.bool_)
@@ -267,7 +267,7 @@ def _solve(
 
 
 class _Features(NamedTuple):
-    """What a level compares, each (F, P): high-pass filtered images, their gradients, brightness, and known pixels."""
+    """Features of a level, each (F, P): high-pass filtered images, their gradients, brightness, and known pixels."""
 
     values: Float32Array
     right: Float32Array
@@ -466,7 +466,7 @@ _GENERATORS = np.array(
 
 
 def _medians(shares: Float64Array) -> Float64Array:
-    """Return the medians (F,) of shares (F, P) without NaN; that of all where there are none."""
+    """Return the medians (F,) of shares (F, P) without NaN; an image of NaN alone gets the median of all."""
     usual = float(np.nanmedian(shares)) if not np.isnan(shares).all() else 1.0
     return np.array([np.nanmedian(row) if not np.isnan(row).all() else usual for row in shares])
 
