@@ -103,7 +103,14 @@ def open_capture(
         stamp = (*stamp, None if matrix_file is None else stamp_content(matrix_file))
         files = replace(files, images=tuple(image for image in files.images for _ in range(CHANNELS)))
     in_folder = files.images
-    files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    try:
+        files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    except InputError as error:
+        if channels is None or ", one for each image" not in error.problem:
+            raise
+        problem = error.problem.replace("one for each image", "three for each image")
+        hint = "With --lights-in-channels, the file needs three lines for each image, in the order R, G, B"
+        raise InputError(problem, path=error.path, hint=hint) from None
     warnings += files.warnings
     if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
         flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))

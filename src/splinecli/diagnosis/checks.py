@@ -214,9 +214,10 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
 
 
 def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
-    """Warn of fewer lights than eight."""
+    """Warn of fewer lights than eight, unless they are channels: one colour image has three."""
     count = len(seen.names)
-    return [CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")] * (count < 8)
+    few = count < 8 and not seen.in_channels
+    return [CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")] * few
 
 
 def lights_near_axis(seen: CaptureSample) -> list[CaptureWarning]:

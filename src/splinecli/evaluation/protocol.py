@@ -30,8 +30,8 @@ def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials:
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        hint = f"Ask for at most {available} lights"
-        raise UsageError(f"{n_lights} lights were requested, but the capture has {available}", hint=hint)
+        hint = f"Use --n-lights {available}, or fewer"
+        raise UsageError(f"the capture has {available} lights, too few for draws of {n_lights}", hint=hint)
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]

@@ -277,7 +277,10 @@ def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> t
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
     height, width, *_ = source.facts[0].size[0]
-    seconds = partial(expected_seconds, n_images=count, image_pixels=height * width, network=network)
+    maps = chosen_maps(options.maps, page=options.html)
+    seconds = partial(
+        expected_seconds, n_images=count, image_pixels=height * width, network=network, align=options.align, maps=maps
+    )
     clock.expect(seconds(height * width, distils=options.distil))
     for_mask = source.n_lights * options.auto_mask  # images that are read to find the object, also after aligning
     advance = clock.begin("read", (count + for_mask) * (1 + options.align), "reading")

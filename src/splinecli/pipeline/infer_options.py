@@ -29,6 +29,7 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
 from splinecli.records import FileName, NotNegative, Option, Positive, Record, Seed
+from splinecli.restoration.alignment import MIN_IMAGES
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file
@@ -334,6 +335,11 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         super().__post_init__()
         if self.n_lights is not None and self.light_indices is not None:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
+        count = self.n_lights if self.light_indices is None else len(self.light_indices)
+        if self.align and count is not None and count < MIN_IMAGES:
+            option = "--n-lights" if self.light_indices is None else "--light-indices"
+            problem = f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}"
+            raise UsageError(problem, hint="Use more lights, or leave --align out")
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         if self.finds_lights and self.refine_lights:

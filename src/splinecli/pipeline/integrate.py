@@ -240,6 +240,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         report["folder"] = str(options.folder.absolute())
         report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
+    if report["level"] is not None:
+        observer.say(f"The surface was levelled by {report['level']['tilt_deg']:.2f} degrees")
     return report
 
 

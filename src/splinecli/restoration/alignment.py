@@ -29,7 +29,11 @@ MIN_IMAGES = 5
 MOST_VALUES = 40_000_000
 """Images are reduced until they have at most so many pixels together: 160 MiB."""
 
-LEAST_FIT = 0.6  # correlation of an aligned image with its prediction; 0.75 and more on objects with any detail
+LEAST_FIT, CLEAR_FIT, MOST_UNLIKE = 0.3, 0.8, 3.0
+"""An image does not fit if its correlation with its prediction from the others is below CLEAR_FIT, and farther from 1
+than the median correlation by the factor MOST_UNLIKE, because images with little detail fit badly, but alike. A median
+below LEAST_FIT leaves nothing to align by: it is 0.05 to 0.25 on a real ball, and 0.44 to 0.95 on two statues."""
+
 LARGEST_MOTION = 0.35  # of a pixel, as a share of the object's longer side
 UNMOVED = 0.1  # pixels; a capture in which no image moved by more is left as it is
 
@@ -53,7 +57,7 @@ class Alignment:
 
     transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each image.
     moved_pixels: (F,), the root mean square motion over the object.
-    fits: (F,), the correlation of the aligned image with its prediction from all images.
+    fits: (F,), the correlation of the aligned image with its prediction from the others.
     """
 
     model: Model
@@ -66,9 +70,15 @@ class Alignment:
     def unexplained(self) -> int | None:
         """The place of an image that fits the others nowhere, or None."""
         worst = int(self.fits.argmin())
-        if self.largest > LARGEST_MOTION:
-            return int(self.moved_pixels.argmax())
-        return worst if self.fits[worst] < LEAST_FIT else None
+        if self.fits[worst] < self.least_fit:
+            return worst
+        return int(self.moved_pixels.argmax()) if self.largest > LARGEST_MOTION else None
+
+    @property
+    def least_fit(self) -> float:
+        """The correlation that is expected of each image."""
+        usual = float(np.median(self.fits))
+        return LEAST_FIT if usual < LEAST_FIT else min(CLEAR_FIT, 1 - MOST_UNLIKE * (1 - usual))
 
 
 def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Alignment:
@@ -174,10 +184,10 @@ def reduced(image: Float32Array, stride: int) -> Float32Array:
     return np.asarray(squares.mean(axis=(1, 3)), np.float32)
 
 
-def place_in_whole(transforms: Float64Array, left: int, top: int, step: int, stride: int) -> Float64Array:
+def place_in_whole(transforms: Float64Array, left: int, top: int, stride: int) -> Float64Array:
     """Return transforms (F, 3, 3) of reduced windows as transforms of whole images."""
-    scale, middle = step * stride, step * (stride - 1) / 2
-    to_whole = np.array([[scale, 0, left + middle], [0, scale, top + middle], [0, 0, 1]], np.float64)
+    middle = (stride - 1) / 2
+    to_whole = np.array([[stride, 0, left + middle], [0, stride, top + middle], [0, 0, 1]], np.float64)
     moved = to_whole @ transforms @ np.linalg.inv(to_whole)
     return np.asarray(moved / moved[:, 2:, 2:])
 
@@ -279,6 +289,7 @@ class _Features(NamedTuple):
 class _Fit(NamedTuple):
     """The matte model of a state: weights (F, P), a root of b's covariance (3, 3, P), b (3, P), residuals (F, P)."""
 
+    lit: Floats  # the weights before the robust fit
     weights: Floats
     root: Float64Array
     surface: Float64Array
@@ -340,11 +351,12 @@ class _Level:
                 return
 
     def correlations(self) -> Float64Array:
-        """Return the correlation (F,) of each image with its prediction."""
+        """Return the correlation (F,) of each image with its prediction from the others, over the lit pixels."""
         fit = self._fit(self.data, self.lights)
-        values, weights = self.data.values.astype(np.float64), fit.weights
-        predicted = values - fit.left
-        sums = ((weights * a * b).sum(axis=1) for a, b in ((values, predicted), (values, values), (predicted,) * 2))
+        values = self.data.values.astype(np.float64)
+        leverage = fit.weights * sum((self.lights @ axis) ** 2 for axis in fit.root)
+        predicted = values - fit.left / np.maximum(1 - leverage, 1e-3)  # the residual without the image itself
+        sums = ((fit.lit * a * b).sum(axis=1) for a, b in ((values, predicted), (values, values), (predicted,) * 2))
         products, squares, others = sums
         return np.asarray(products / np.sqrt(squares * others + 1e-30))
 
@@ -395,7 +407,7 @@ class _Level:
             weights = lit / (1 + (left / scale) ** 2)
         root, surface, left = _matte(values, weights, lights)
         cost = float((lit * np.log1p((left / scale) ** 2) * scale**2).sum() / max(lit.sum(), 1e-6))
-        return _Fit(weights, root, surface, left, scale, cost)
+        return _Fit(lit, weights, root, surface, left, scale, cost)
 
     def _equations(self, fit: _Fit) -> tuple[Float64Array, Float64Array, float]:
         """Return the normal equations of all images' parameters and lights, without b, and the weight of a prior."""
