@@ -56,7 +56,7 @@ def wrong_files(lights: Array, rng: np.random.Generator) -> Iterator[tuple[str, 
     one, other = sorted(rng.choice(n_lights, 2, replace=False).tolist())
     swapped = np.arange(n_lights)
     swapped[[one, other]] = other, one
-    mend = f"with those of {one + 1} and {other + 1} exchanged"
+    mend = f"with the lights of {one + 1} and {other + 1} exchanged"
     yield "two exchanged", lights[swapped], lambda check: words(check) == mend
 
 

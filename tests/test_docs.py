@@ -1,10 +1,12 @@
 """The documentation agrees with the code: links, commands, constants and tables of figures."""
 
+import doctest
 import json
 import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import pytest
@@ -12,11 +14,13 @@ import typer
 
 import figure_plots
 import figure_tables
+import splinecli
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
+PACKAGE = Path(splinecli.__file__).parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *DOCS.glob("*.md"), REPOSITORY / "examples/README.md"])
 
 
@@ -120,6 +124,19 @@ def test_python_page(tmp_path, monkeypatch):
     assert names["estimate"].errors.mean < 7
     assert names["report"]["capture"] == "medallion"
     assert (tmp_path / "results/medallion/albedo.png").is_file()
+
+
+def test_examples_of_docstrings(tmp_path, monkeypatch):
+    """Each function of the Python pages has an example, and all examples of the package print what they show."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
+    imports = re.findall(r"^from (splinecli\S*) import ([a-z]\w*)$", text_of("docs/python.md"), re.MULTILINE)
+    documented = {".".join(names) for names in imports} | {f"splinecli.{name}" for name in splinecli.__all__[1:]}
+    assert [name for name in sorted(documented) if ">>>" not in resolve_name(name).__doc__] == []
+    sources = (path for path in PACKAGE.rglob("*.py") if ">>> " in path.read_text("utf-8"))
+    modules = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in sources]
+    results = {name: doctest.testmod(resolve_name(name.removesuffix(".__init__"))) for name in modules}
+    assert {name: result.failed for name, result in results.items() if result.failed} == {}
 
 
 def test_fields_of_the_report():

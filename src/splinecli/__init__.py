@@ -95,6 +95,17 @@ def estimate_normals(
             three, below the horizon, all in one plane), or the mask is empty.
         splinecli.errors.ModelError: the weights cannot be used.
 
+    Examples:
+        A matte plane under four lights:
+
+        >>> import numpy as np
+        >>> import splinecli
+        >>> lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
+        >>> images = np.ones((4, 8, 8)) * (lights @ (0.36, 0.48, 0.8))[:, None, None]
+        >>> estimate = splinecli.estimate_normals(images, lights, method="ls")
+        >>> print(estimate.normal_map[0, 0].round(2))
+        [0.36 0.48 0.8 ]
+
     References:
         Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and normal estimation
         networks, ICCV 2019.
@@ -153,6 +164,18 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
 
     Raises:
         splinecli.errors.InputError: there are fewer than four lights.
+
+    Examples:
+        An orange matte plane under four lights:
+
+        >>> import numpy as np
+        >>> import splinecli
+        >>> lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
+        >>> colours = np.ones((4, 8, 8, 1)) * lights[:, None, None, 2:] * (0.8, 0.4, 0.16)
+        >>> estimate = splinecli.estimate_normals(colours, lights, method="ls")
+        >>> base = splinecli.estimate_material(estimate, colours).base_colour
+        >>> print((base[0] / base[0].max()).round(1))
+        [1.  0.5 0.2]
     """
     import numpy as np
 
@@ -193,6 +216,15 @@ def integrate_normals(
         splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
         splinecli.errors.InputError: the mask is empty, a normal in the mask is not a unit vector, or the camera matrix
             is not valid.
+
+    Examples:
+        A plane that rises by 0.75 pixels for each column:
+
+        >>> import numpy as np
+        >>> import splinecli
+        >>> heights = splinecli.integrate_normals(np.full((4, 5, 3), (-0.6, 0.0, 0.8)))
+        >>> print(np.diff(heights[0]).round(2))
+        [0.75 0.75 0.75 0.75]
 
     References:
         Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022.

@@ -14,7 +14,7 @@ def run() -> None:
         # NumPy's products are small here, and on a busy machine several times as fast on one core. It reads this once.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         if not sys.warnoptions:  # python -W
-            warnings.simplefilter("ignore")  # those of libraries, such as NumPy's
+            warnings.simplefilter("ignore")  # from libraries, such as NumPy
             # Of Python's process that counts semaphores, too: SIGTERM may end this process first.
             os.environ.setdefault("PYTHONWARNINGS", "ignore")
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
@@ -28,8 +28,8 @@ def run() -> None:
         code = report_interruption()
     ignore_signals()
     if code == INTERRUPTED or "TORCHELASTIC_RUN_ID" in os.environ:
-        # os._exit does not wait for threads. Those of Dask, in the middle of their start, would print tracebacks. Those
-        # of PyTorch sometimes abort a process of torchrun after its work is done, which torchrun counts as a failure.
+        # os._exit does not wait for threads. Dask's threads would print tracebacks if they are just starting. PyTorch's
+        # threads sometimes abort a process after its work is done, which torchrun reports as a failure.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

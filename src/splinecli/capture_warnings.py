@@ -81,26 +81,26 @@ ESTIMATED_LIGHTS = WarningKind("estimated_lights",
 EXIF_EXPOSURE = WarningKind("exif_exposure", "EXIF states different exposures, by which the images were divided",
     "Expose all images alike, with exposure and white balance fixed")
 EXIF_ORIENTATION = WarningKind("exif_orientation",
-    "An EXIF tag turns the images in viewers; splinecli uses the stored pixels",
+    "An EXIF tag rotates the images in viewers; splinecli uses the stored pixels",
     "Make mask and lights for the stored pixels")
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
 GRAY_MATERIAL = WarningKind("gray_material", "With `--maps material`: gray images have no base colour, only brightness")
 GROUND_TRUTH_FRAME = WarningKind("ground_truth_frame",
     "The ground truth fits the images only with x or y negated, or exchanged",
     "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`", severity="error")
-GROUND_TRUTH_SHIFTED = WarningKind("ground_truth_shifted", "The ground truth fits the images only when it is moved",
+GROUND_TRUTH_SHIFTED = WarningKind("ground_truth_shifted", "The ground truth fits the images only after a shift",
     "Align it with the images", severity="error")
-GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was turned upside down")
+GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was upside down and was flipped")
 GROUND_TRUTH_Z = WarningKind("ground_truth_z", "The ground truth points away from the camera", "Negate its z",
     severity="error")
 IMAGE_INCONSISTENT = WarningKind("image_inconsistent",
     "One image [contradicts the others](input-checks.md#one-odd-image)",
     "Photograph it again, or leave it out with `--light-indices`", severity="error")
 IMAGE_SCALE = WarningKind("image_scale",
-    "One image is 16, 64 or 256 times darker or brighter than the others predict, as 12 bits among 16 are",
-    "Save all images in one way", severity="error")
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with 12 bits among 16",
+    "Save all images with the same bit depth", severity="error")
 IMAGES_ALIGNED = WarningKind("images_aligned",
-    "The images were [aligned](image-preparation.md#moved-images), as `--align` asks")
+    "The images were [aligned](image-preparation.md#moved-images), as `--align` requests")
 IMAGES_LEFT_OUT = WarningKind("images_left_out",
     "The light file does not name all images, or pictures have names of masks or maps, or another size",
     "Check names and sizes")
@@ -117,31 +117,32 @@ LIGHT_FRAME = WarningKind("light_frame",
     "`--light-frame` or `info --mended-lights`, as the warning says", severity="error")
 LIGHT_ORDER = WarningKind("light_order", "The lights are probably in another order than the images",
     "Correct the light file", severity="error")
-LIGHTS_ILL_CONDITIONED = WarningKind("lights_ill_conditioned", "The lights determine the normals badly",
+LIGHTS_ILL_CONDITIONED = WarningKind("lights_ill_conditioned", "The lights determine the normals poorly",
     "Add lights from other sides")
 LIGHTS_IN_CHANNELS = WarningKind("lights_in_channels",
-    "Each channel of the images counts as a light, as `--lights-in-channels` asks; coloured objects get wrong normals",
+    "The channels are read as images under three lamps, as `--lights-in-channels` requests; coloured objects get wrong "
+    "normals",
     "A [crosstalk matrix](coloured-lights.md), and gray objects")
 LIGHTS_MATCHED = WarningKind("lights_matched", "Lights were matched to images by another rule than the full name",
     "Check the order of the lights")
 LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the camera axis", "Add lower lights")
 LIGHTS_UNCHECKED = WarningKind("lights_unchecked",
-    "Shadows that the lights should cast are missing; with `--strict`, also where the order or the frame of the "
+    "Shadows that the lights should cast are missing; with `--strict`, also if the order or the frame of the "
     "lights [cannot be checked](input-checks.md#wrong-light-directions)", "Compare bumps and hollows with the object")
-LOW_CONFIDENCE = WarningKind("low_confidence", "The network finds nearly all normals uncertain",
+LOW_CONFIDENCE = WarningKind("low_confidence", "The network predicts large errors for nearly all normals",
     "Check the lights, the mask and the images", severity="error")
 MASK_CHOICE = WarningKind("mask_choice",
-    "There is no `mask.*`, so a picture with the word `mask` in its name, or the alpha channel of the images, is the "
-    "mask; of several pictures, none is", "`--mask FILE` for another one")
-MASK_INVERTED = WarningKind("mask_inverted", "The mask leaves out a bright area in the middle",
+    "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the images, is used as "
+    "the mask; several such pictures are ignored", "`--mask FILE` for another one")
+MASK_INVERTED = WarningKind("mask_inverted", "The mask excludes a bright area in the middle",
     "Invert it: white on the object", severity="error")
 NEAR_LAMPS = WarningKind("near_lamps",
-    "The folder has positions, or vectors look like positions, but the lights count as distant",
+    "The folder has positions, or vectors look like positions, but the lights are treated as distant",
     "`--light-positions FILE`, or leave `--lights` out")
 NEAR_LIGHTS_SUSPECTED = WarningKind("near_lights_suspected",
     "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
-    "[Say where they are](near-lamps.md)", severity="error")
-NO_MASK = WarningKind("no_mask", "No mask leaves out pixels, and most of them are near black",
+    "[Specify their positions](near-lamps.md)", severity="error")
+NO_MASK = WarningKind("no_mask", "No mask excludes pixels, and most of them are nearly black",
     "`--auto-mask`, or a mask")
 NONLINEARITY_SUSPECTED = WarningKind("nonlinearity_suspected",
     "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read as linear",
@@ -153,7 +154,7 @@ PROFILE_UNREAD = WarningKind("profile_unread", "The curve of a colour profile ca
 REFINED_LIGHTS = WarningKind("refined_lights", "`--refine-lights` moved the light directions",
     "Compare with the given directions")
 REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
-REPEATED_IMAGES = WarningKind("repeated_images", "Two images are equal, their lights are not", "Replace one of them",
+REPEATED_IMAGES = WarningKind("repeated_images", "Two images are equal, but their lights differ", "Replace one of them",
     severity="error")
 ROUGH_LIGHTS = WarningKind("rough_lights", "Refined light directions would fit much better",
     "[`--refine-lights`](infer.md#rough-directions), or measure them again")
@@ -162,7 +163,7 @@ ROUGHNESS_UNDETERMINED = WarningKind("roughness_undetermined",
     "roughness](materials.md#limits)", "Add lights, some of them near the camera axis")
 SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Expose shorter")
 UNEQUAL_INTENSITIES = WarningKind("unequal_intensities",
-    "Light intensities look unequal, but the images do not determine them; or those of the file do not fit the images",
+    "Light intensities look unequal, but the images do not determine them; or given intensities do not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file", severity="error")
 UNTRAINED_LIGHTS = WarningKind("untrained_lights", "The weights were not trained with this number of lights",
     "`--n-lights`, other weights, or `--method spline-net`")
@@ -178,7 +179,7 @@ SATURATED_SHARE = 0.01  # share of saturated observations above which the captur
 
 def mask_inverted(name: str) -> CaptureWarning:
     """Warn that a mask is probably black on the object."""
-    text = f"{name} leaves out a bright area in the middle and keeps what surrounds it: it is probably inverted."
+    text = f"{name} excludes a bright area in the middle and keeps its surroundings, so it is probably inverted."
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
 
 
@@ -192,6 +193,6 @@ def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
     """Report that the light directions were estimated from the images, with expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,
-        f"The light directions were estimated from the images. They are expected to be wrong by {errors_deg.mean():.0f}"
-        f" degrees on average, the worst one by {errors_deg.max():.0f}; the normals turn with them.",
+        f"The light directions were estimated from the images. Their expected error is {errors_deg.mean():.0f} degrees"
+        f" on average and {errors_deg.max():.0f} degrees for the worst one; the normals inherit these errors.",
     )

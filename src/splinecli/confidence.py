@@ -75,7 +75,7 @@ def add_common_error(errors: Float32Array, error_deg: float) -> None:
 class CaptureFeatures(NamedTuple):
     """Numbers that describe how well a capture fits the assumptions. NaN is unknown.
 
-    A misfit is the log of a matte surface's residuals, as a share of the brightness and a median over pixels; a
+    Misfits are logs of a matte surface's residuals, as a share of the brightness and a median over pixels; a
     turn is the log of the median angle in degrees by which normals would rotate.
     """
 

@@ -22,6 +22,15 @@ class SplinecliError(Exception):
         path: the file or folder that causes the failure, if any.
         line: the line in that file, counted from 1, if any.
         hint: the remedy, as one sentence without the final full stop.
+
+    Examples:
+        >>> from splinecli.errors import SplinecliError
+        >>> from splinecli.methods import make_estimator
+        >>> try:
+        ...     make_estimator("photoshop")
+        ... except SplinecliError as error:
+        ...     print(error.exit_code, error.problem.partition(";")[0])
+        2 no method named 'photoshop'
     """
 
     exit_code = 1

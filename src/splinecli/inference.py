@@ -107,6 +107,14 @@ def estimate_normals(
     The capture of the result has the points of this surface. `progress` is called with the number of pixels just
     finished, after each batch of the estimator. The clock times the stages that follow, and shows them. Raises
     SplinecliError if the normals are not unit vectors.
+
+    Examples:
+        >>> from splinecli.capture import read_capture
+        >>> from splinecli.inference import estimate_normals
+        >>> from splinecli.methods import make_estimator
+        >>> estimate = estimate_normals(read_capture("examples/medallion"), make_estimator("ls"))
+        >>> round(estimate.errors.mean, 1)
+        6.0
     """
     started = time.perf_counter()
     capture = find_surface(capture)

@@ -40,7 +40,7 @@ class OutputMap:
     needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
     bytes_per_pixel, bytes_per_observation: memory. Maps that need any are computed before the others are written.
     fewest_lights: number of lights below which the map is refused.
-    parts: if the map is written as several maps, their names, channels and pictures in place of the above.
+    parts: if the map is written as several maps, their names, channels and pictures instead of the above.
     """
 
     name: str
@@ -61,7 +61,7 @@ class OutputMap:
 
     @property
     def files(self) -> dict[str, str]:
-        """The names of the map's files, by suffix; those of parts, by their names."""
+        """The names of the map's files by suffix; if it has parts, by name."""
         if self.parts:
             return {name: name for part in self.parts for name in part.files}
         return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
@@ -70,7 +70,7 @@ class OutputMap:
         """Raise InputError, about a capture in `path`, if there are too few lights for the map."""
         if count < self.fewest_lights:
             raise InputError(
-                f"{count} lights do not determine the {self.name}, expected at least {self.fewest_lights}",
+                f"--maps {self.name} needs at least {self.fewest_lights} lights, found {count}",
                 path=path,
                 hint=f"Use more lights, or leave {self.name} out of --maps",
             )

@@ -116,7 +116,10 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                     one: Any = Annotated[number, limits(kind)]
                     items = [fit(one, item, title, UsageError, strict=False) for item in _each(value)]
                     value = tuple(items) if option.repeated else items[0]
-                values[name] = str(value) if PATH in _metadata(kind) else value
+                is_name = PATH in _metadata(kind)
+                if (is_name or isinstance(value, Path)) and not option.is_argument and str(value).startswith("-"):
+                    raise UsageError(f"{title} needs a file or folder, found {value}", hint="Name it after the option")
+                values[name] = str(value) if is_name else value
             elif option is not None and option.is_argument and option.repeated:
                 values[name] = ()
         return cls(**values)

@@ -158,7 +158,7 @@ def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: boo
     found = triangulate_lamps(balls)
     assert found is not None and not found.known
     report = calibration_report(combine_balls(balls), None, None, picture="calibration.png", lamps=found)
-    assert summary_lines(report)[-1] == "the lamps' distances are unknown: they count as distant"
+    assert summary_lines(report)[-1] == "the lamps' distances are unknown: they are treated as distant"
     expected = "put the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
     assert any(expected in warning for warning in report["warnings"])
     assert triangulate_lamps(balls[:1]) is None

@@ -293,7 +293,7 @@ def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) 
     assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
     for number in (12, 13):
         picture(folder / f"{number:03}.png", PICTURES[0])
-    with pytest.raises(InputError, match=r"found 12 light directions, expected 17.* none is left for 012\.png"):
+    with pytest.raises(InputError, match=r"found 12 light directions, expected 17.* it has none for 012\.png"):
         open_capture(folder)
 
 

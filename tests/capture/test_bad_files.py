@@ -55,7 +55,7 @@ def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: b
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.rint(shading * 40_000).astype(np.uint16))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
-    with pytest.raises(InputError, match="the 8 lights lie in one plane"):
+    with pytest.raises(InputError, match="the 8 lights are in one plane"):
         read_capture(tmp_path, as_stored=as_stored)
 
 

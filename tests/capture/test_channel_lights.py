@@ -16,7 +16,8 @@ from splinecli.capture.channel_lights import channel_lights
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading
+from splinecli.pipeline.info import describe_capture, summary_lines
 
 Floats = NDArray[np.float64]
 NORMALS, MASK = sphere(90)
@@ -56,6 +57,19 @@ def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path:
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
     report = json.loads((tmp_path / "out/gray/report.json").read_text())
     assert report["n_lights"] == 3 * count and "lights_in_channels" in [each["code"] for each in report["warnings"]]
+
+
+def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
+    folder = write(tmp_path / "gray", 1)
+    reading = Reading(lights_in_channels=True)
+    report = describe_capture(InfoOptions(capture=folder), reading)
+    assert report["images"] == 1 and "few_lights" not in report["warning_codes"]
+    assert "images       1 (000.png): 90 x 90, RGB" in summary_lines(report)[1]
+    source = reading.open(folder)
+    assert source.image_names((0, 2)) == ["000.png (R)", "000.png (B)"]
+    np.savetxt(folder / "light_directions.txt", LIGHTS[:1])
+    with pytest.raises(InputError, match=r"found 1 light direction, expected 3, three for each image.* R, G, B"):
+        reading.open(folder)
 
 
 def test_the_networks_take_two_images(tmp_path: Path) -> None:

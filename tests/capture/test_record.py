@@ -39,7 +39,7 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
         ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
         ({"light_directions": LIGHTS * 1.01}, "a light direction is not a unit vector"),
         ({"light_directions": LIGHTS * np.nan}, "a light direction is not finite"),
-        ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 lies below the horizon \(z <= 0\)"),
+        ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 is below the horizon \(z <= 0\)"),
         ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
         ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
         ({"ground_truth": np.zeros((3, 2, 3))}, r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)"),

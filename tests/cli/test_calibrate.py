@@ -72,7 +72,7 @@ def test_positions_need_the_camera(run):
             cv2.imwrite(str(path), np.pad(picture, ((0, 0), pads), constant_values=13107))
     circles = ["--circle", "60,48,40", "--circle", "240,48,40"]
     result = run("calibrate", "one", "two", *circles)
-    assert "the lamps' distances are unknown: they count as distant" in result.err
+    assert "the lamps' distances are unknown: they are treated as distant" in result.err
     assert "warning: The lamps' distances are unknown, because the camera is" in result.err
     assert not Path("calibration/light_positions.txt").exists()
     matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))

@@ -74,9 +74,9 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
 
 def test_lights_that_crowd(run, medallion):
     given = np.loadtxt(medallion / "light_directions.txt")
-    for change, words in (((0.1, 0.1, 1), "lie in a narrow cone"), ((1, 0.05, 1), "lie nearly in one plane")):
+    for change, words in (((0.1, 0.1, 1), "are in a narrow cone"), ((1, 0.05, 1), "are nearly in one plane")):
         np.savetxt(medallion / "light_directions.txt", given * change)
-        assert f"The lights {words}" in run("info", medallion).err
+        assert f"All lights {words}" in run("info", medallion).err
     run("infer", medallion, "--method", "ls")
     assert "lights_ill_conditioned" in codes()
 

@@ -256,6 +256,12 @@ def test_a_picture_of_the_depth(run):
         assert f"1 = {low:.7g}, 65535 = {high:.7g}; unit: millimetre" in opened.info["depth"]
 
 
+def test_the_angle_of_a_levelled_surface_is_printed(run):
+    np.save("tilted.npy", np.full((20, 30, 3), (0.0, np.sin(np.radians(5)), np.cos(np.radians(5))), np.float32))
+    result = run("integrate", "tilted.npy", "-o", "out", "--level", "plane")
+    assert (result.code, result.err) == (0, "The surface was levelled by 5.00 degrees\n")
+
+
 def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
     """A mesh without triangles, and one that takes more memory than there is, have one message before the work."""
     mask = np.zeros((24, 24), np.uint8)

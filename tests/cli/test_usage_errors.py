@@ -54,6 +54,13 @@ def test_refused_options_of_clusters(arguments, message, capture, make_capture, 
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize("option", ["--crosstalk", "--mask", "--output"])
+def test_an_option_is_not_the_value_of_the_one_before(option, capture, run):
+    result = run("infer", capture, "--lights-in-channels", option, "--strict")
+    assert result.code == 2
+    assert f"{option} needs a file or folder, found --strict. Name it after the option." in result.err
+
+
 @pytest.mark.parametrize("arguments", [("--workers", "2"), ("--cluster", "tcp://127.0.0.1:1")])
 def test_without_dask(arguments, capture, make_capture, run, monkeypatch):
     make_capture("second")

@@ -57,7 +57,7 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None
         (("--json",), "--json prints one list at the end, and watch has none"),
         (("--shard", "1/2"), "--shard splits a list of captures"),
         (("other",), "found other after the dashes, expected options of infer"),
-        (("-o", "sphere/../sphere"), "the results would lie among the captures"),
+        (("-o", "sphere/../sphere"), "the results would be among the captures"),
         (("--methd", "ls"), "no option --methd"),
         (("--method", "lss"), "no method named 'lss'"),
         (("--overwrite", "--update"), "contradict each other"),

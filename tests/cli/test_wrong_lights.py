@@ -59,7 +59,7 @@ def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(run,
     write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
     for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):
         found = run(*command, *options).err
-        assert "much better with those of 02.png and 06.png exchanged (misfit" in found
+        assert "much better with the lights of 02.png and 06.png exchanged (misfit" in found
 
 
 def test_info_lists_the_readings(run, medallion):
@@ -119,7 +119,7 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     write_lights(medallion, lambda lights: lights * (-1, -1, 1))
     relief = run("info", medallion, "--strict")
     assert relief.code == 0
-    assert "could not be checked of the lights of light_directions.txt: whether x and y are both" in relief.err
+    assert "The lights of light_directions.txt could not be fully verified. Unchecked: whether x and y" in relief.err
 
 
 def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):

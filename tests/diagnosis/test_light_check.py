@@ -65,7 +65,7 @@ def test_each_wrong_frame_is_named_with_the_frame_that_mends_it(frame: LightFram
 
 ORDERS = {
     "right": (np.arange(14), None),
-    "swapped": (np.r_[0, 1, 9, 3:9, 2, 10:14], "with those of 3 and 10 exchanged"),
+    "swapped": (np.r_[0, 1, 9, 3:9, 2, 10:14], "with the lights of 3 and 10 exchanged"),
     "shuffled": (np.random.default_rng(1).permutation(14), UNKNOWN_ORDER),
     "shifted": (np.roll(np.arange(14), 1), SHIFTED),
     "reversed": (np.arange(14)[::-1], "in reversed order, beginning with light 14"),

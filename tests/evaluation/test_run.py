@@ -121,7 +121,7 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_p
     reasons = [skipped.reason for skipped in evaluation.skipped]
     assert reasons[0].startswith(f"{untrue}: the capture has no ground truth.")
     assert str(broken / "003.png") in reasons[1]
-    assert reasons[2] == "5 lights were requested, but the capture has 4. Ask for at most 4 lights."
+    assert reasons[2] == "the capture has 4 lights, too few for draws of 5. Use --n-lights 4, or fewer."
     assert str(tmp_path / "missing") in reasons[3]
 
 
@@ -132,7 +132,7 @@ def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> No
     for folders, error, message in (
         ([untrue, few], InputError, none),
         ([untrue], InputError, "untrue: the capture has no ground truth"),
-        ([few], UsageError, "5 lights were requested, but the capture has 4"),
+        ([few], UsageError, "the capture has 4 lights, too few for draws of 5"),
     ):
         with pytest.raises(error, match=message):
             evaluate(folders, [ls], Protocol(n_lights=5))

@@ -216,7 +216,7 @@ def test_three_lights_are_refused(glossy, tmp_path):
     options = InferOptions(
         method="ls", maps=("material",), light_indices=(0, 1, 2), output=str(tmp_path / "out"), as_stored=True
     )
-    with pytest.raises(InputError, match="3 lights do not determine the material, expected at least 4"):
+    with pytest.raises(InputError, match="--maps material needs at least 4 lights, found 3"):
         infer_capture(glossy, options)
 
 
@@ -276,7 +276,7 @@ def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
         datasets=(glossy,), methods=("ls",), n_lights=(None,), relight=True, output=str(tmp_path / "scores")
     )
     outcome = evaluate_captures(options)
-    assert outcome.figure_problems == ["ball: no light is held out. Use fewer --n-lights."]
+    assert outcome.figure_problems == ["ball: the draw uses all lights, so none is held out. Use a smaller --n-lights."]
 
 
 def test_unequal_white_balance_changes_the_base_colour_alone(glossy):

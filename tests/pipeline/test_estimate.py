@@ -12,13 +12,24 @@ from scenes import Teacher, cap_directions, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
 from splinecli.methods.estimator import LeastSquares, StudentSize
+from splinecli.output_files import MAPS
 from splinecli.pipeline import infer
+from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.infer import AUTOMATIC_FROM, REFINED_PIXELS, distil_for
 from splinecli.pipeline.info import ORIGINS
 from splinecli.refinement.refiner import MARGIN, TILE
 from splinecli.restoration.images import Origin
 
 LIGHTS = spiral_lights(6, 40)
+
+
+def test_alignment_and_maps_are_expected_to_take_time() -> None:
+    images = (12_000, 10, 1_000_000)  # 10 images of 12,000 pixels in the mask, and of a megapixel
+    plain, aligned, material = (
+        sum(expected_seconds(*images, **options).values())
+        for options in ({}, {"align": True}, {"maps": (MAPS["material"],)})
+    )
+    assert aligned - plain > 20 and material - plain > 2
 
 
 @dataclass

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import ring_lights, shade, write_capture
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 from splinecli.fits.robust import fit_scaled_normals
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.pipeline.infer import infer_capture
@@ -122,17 +122,27 @@ def test_aligned_images_give_the_normals_of_unmoved_ones() -> None:
     assert angle_between_deg(unit(one), unit(other)).mean() < 0.3
 
 
-def test_another_object_is_not_explained() -> None:
-    images = photographs(motions(0, "translation"), textured=True)
-    images[3] = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE))
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda image: image[::-1, ::-1],
+        lambda image: np.random.default_rng(0).uniform(0, 1, image.shape),
+        lambda image: np.random.default_rng(0).uniform(0, 1, image.shape) * MASK,
+    ],
+    ids=["upside-down", "another-object", "another-object-of-its-shape"],
+)
+@pytest.mark.parametrize("textured", [True, False])
+def test_an_image_that_fits_nowhere_is_named(spoil: Callable[[Floats], Floats], textured: bool) -> None:
+    images = photographs(motions(2.0, "translation"), textured=textured, gloss=0.3)
+    images[3] = spoil(images[3])
     assert align_images(images, MASK, LIGHTS).unexplained == 3
 
 
 def test_transforms_of_reduced_windows_hold_in_whole_images() -> None:
     shift = np.eye(3)[None].repeat(2, 0)
     shift[1, :2, 2] = 1.5, -0.5
-    whole = place_in_whole(shift, left=10, top=20, step=2, stride=3)
-    assert whole[1] == pytest.approx(np.array([[1, 0, 9.0], [0, 1, -3.0], [0, 0, 1]]))
+    whole = place_in_whole(shift, left=10, top=20, stride=3)
+    assert whole[1] == pytest.approx(np.array([[1, 0, 4.5], [0, 1, -1.5], [0, 0, 1]]))
     assert reduced(np.arange(35, dtype=np.float32).reshape(5, 7), 3).tolist() == [[8.0, 11.0]]
 
 
@@ -145,8 +155,8 @@ def test_pixels_that_an_image_lacks_are_not_common() -> None:
 
 @pytest.fixture
 def write_moved(tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    def write(spoilt: bool = False) -> Path:
-        images = photographs(motions(3.0, "translation"), textured=True)
+    def write(spoilt: bool = False, pixels: float = 3.0) -> Path:
+        images = photographs(motions(pixels, "translation"), textured=True)
         if spoilt:
             images[2] = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE))
         stored = np.rint(images / images.max() * 60_000).astype(np.uint16)
@@ -170,11 +180,18 @@ def test_infer_aligns_and_reports(write_moved: Callable[..., Path], tmp_path: Pa
     assert part["alignment"]["reference"] == "001.png" and len(part["alignment"]["transforms"]) == 5
 
 
+def test_unmoved_images_are_no_reason_to_warn(write_moved: Callable[..., Path], tmp_path: Path) -> None:
+    report = infer(write_moved(pixels=0.0), tmp_path)
+    assert "images_aligned" not in [warning["code"] for warning in report["warnings"]]
+    assert max(report["alignment"]["moved_pixels"]) < 0.1
+
+
 def test_captures_that_cannot_be_aligned_are_refused(write_moved: Callable[..., Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot explain 002\.png"):
+    with pytest.raises(InputError, match=r"cannot match 002\.png"):
         infer(write_moved(spoilt=True), tmp_path)
-    with pytest.raises(InputError, match="needs 5 images or more"):
-        infer(write_moved(), tmp_path, light_indices=(0, 1, 2, 3))
+    for options in ({"light_indices": (0, 1, 2, 3)}, {"n_lights": 4}):
+        with pytest.raises(UsageError, match="leaves 4 images, but --align needs at least 5"):
+            infer(write_moved(), tmp_path, **options)
 
 
 def test_large_captures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,7 +65,7 @@ def test_levels_are_parsed() -> None:
 
 def test_points_must_be_on_the_object_and_not_in_a_line() -> None:
     heights = plate()[0]
-    with pytest.raises(UsageError, match="90,10, which is not on the object"):
+    with pytest.raises(UsageError, match="the point 90,10 of --level is not on the object"):
         plane_slopes(heights, ((1, 1), (5, 5), (90, 10)))
     with pytest.raises(UsageError, match="in a line"):
         plane_slopes(heights, ((1, 1), (5, 5), (20, 20)))

@@ -252,7 +252,7 @@ def calibrate_ball(
     for path in files.images:
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
-            raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
+            raise InputError("the circle is outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
             full_scale = 1.0 if stored.dtype.kind == "u" else None
             highlight = find_highlight(to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale)

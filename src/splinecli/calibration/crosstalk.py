@@ -40,8 +40,8 @@ def measure_crosstalk(
     count = len(files.images)
     if CHANNELS * count != len(light_directions):
         problem = f"found {count} colour images of the gray ball and {len(light_directions)} lights, expected three"
-        hint = "The mirror ball needs three images, one lamp at a time, for each colour image: R, G, B"
-        raise InputError(f"{problem} for each image", path=files.folder, hint=hint)
+        hint = "For each colour image, photograph the mirror ball under each lamp alone, in the order R, G, B"
+        raise InputError(f"{problem} lights for each image", path=files.folder, hint=hint)
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
     check_exposures(files.facts)
     capture = CaptureSource(

@@ -270,7 +270,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         )
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
-        lines.append("the lamps' distances are unknown: they count as distant")
+        lines.append("the lamps' distances are unknown: they are treated as distant")
     elif lamps:
         distances = np.linalg.norm(lamps["positions"], axis=1)
         shares = 100 * np.array(lamps["uncertainty"]) / distances
@@ -298,11 +298,11 @@ def _warnings(
     ]
     if lamps is not None and not lamps.known:
         warnings.append(
-            "The rays from the balls are too parallel to tell the lamps' distances. If the lamps are near, put the"
+            "The rays from the balls are too parallel to measure the lamps' distances. If the lamps are near, put the"
             " balls farther apart."
             if lamps.view.known
-            else "The lamps' distances are unknown, because the camera is: it counts as distant, and a near camera"
-            " makes the rays from the balls too parallel. If the lamps are near, add --camera-matrix."
+            else "The lamps' distances are unknown, because the camera is: it is treated as distant, which makes"
+            " the rays from the balls too parallel if it is near. If the lamps are near, add --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
@@ -318,7 +318,7 @@ def _warnings(
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of the light directions:"
-                " each lies half-way between the view and the light. Use the file written here."
+                " each is half-way between the view and the light. Use the file written here."
             )
     return warnings
 

@@ -34,7 +34,7 @@ class ChannelLights:
         Raises InputError for a gray image.
         """
         if linear.shape[1] != CHANNELS:
-            problem = "the image is gray, but --lights-in-channels takes a light from each of three channels"
+            problem = "the image is gray, but --lights-in-channels reads a light from each of three channels"
             raise InputError(problem, path=path, hint="Leave --lights-in-channels out")
         channel = index % CHANNELS
         matrix = self.crosstalk[index // CHANNELS % len(self.crosstalk)]
@@ -42,13 +42,11 @@ class ChannelLights:
         return stored[:, channel, None], np.maximum(unmixed, 0)[:, None]
 
     def in_words(self) -> str:
-        text = "The channels R, G, B of each image count as photographs under three lamps. This is right for gray"
-        text += " objects only: the normals of coloured ones are wrong."
+        text = "The channels R, G, B of each image are read as photographs under three lamps. This is only valid for"
+        text += " gray objects; coloured objects get wrong normals."
         if not self.measured:
-            text += (
-                f" There is no {CROSSTALK}, so each channel is assumed to respond to its own lamp only: measure it with"
-            )
-            text += " calibrate --gray-ball DIR --lights-in-channels."
+            text += f" Without {CROSSTALK}, each channel is assumed to respond to its own lamp only; measure the"
+            text += " crosstalk with calibrate --gray-ball DIR --lights-in-channels."
         return text
 
 
@@ -60,7 +58,7 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
     if condition > LARGEST_CONDITION:
         number = f"the condition number {condition:.0f}" if condition < 1e6 else "no inverse"
         problem = f"the channels do not separate the lamps: the crosstalk matrix has {number}"
-        hint = f"Expected a condition number of at most {LARGEST_CONDITION:.0f}: use lamps of more different colours"
+        hint = f"Expected a condition number of at most {LARGEST_CONDITION:.0f}: use lamps with more distinct colours"
         raise InputError(problem, path=path, hint=hint)
 
 

@@ -106,7 +106,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
         suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
         found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
         problem = "the folder contains no images" + (f", but {found}" if found else "")
-        hint = "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files count as images"
+        hint = "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as images"
         raise NoImagesError(problem, path=folder, hint=hint)
 
 

@@ -52,7 +52,7 @@ class NearLamps:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
             raise InputError(f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)")
         if (self.positions[:, 2] <= 0).any():
-            raise InputError("a lamp lies behind the object (z <= 0)", hint="z points to the camera")
+            raise InputError("a lamp is behind the object (z <= 0)", hint="z points to the camera")
         if not 0 < self.pixel_size < np.inf:
             raise InputError(f"the pixel size is {self.pixel_size:g}, expected a number above 0")
 
@@ -188,14 +188,14 @@ def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools)
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
-        text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
+        text = f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or --object-width."
         return [CaptureWarning(NEAR_LAMPS, text)]
     angle_deg = lamps.angles_across_deg(mask).max()
     if angle_deg <= 2.0:
         return []
     text = (
         f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
-        " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
+        " and the edge of the object, but the lights are treated as distant. Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -214,7 +214,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
         return []
     text = (
         f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g}, as positions of"
-        " lamps have, but count as directions. If they are positions, use --light-positions."
+        " lamps have, but are read as directions. If they are positions, use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -401,7 +401,7 @@ def _read_pixel_size(path: Path) -> float:
     size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
         problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
-        hint = "Write the number alone; its unit is that of the lamps' positions"
+        hint = "Write the number alone; its unit is the unit of the lamps' positions"
         raise InputError(problem, path=path, line=line, hint=hint)
     return size
 

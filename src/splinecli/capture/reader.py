@@ -67,6 +67,12 @@ def open_capture(
         InputError: find_capture_files does not recognise the folder, a light file is wrong, or the window is not inside
             the images.
         UsageError: the white level is not a number above 0, or the object's width is given and a part is read.
+
+    Examples:
+        >>> from splinecli.capture import open_capture
+        >>> source = open_capture("examples/medallion")
+        >>> source.n_lights, source.files.images[0].name
+        (10, '01.png')
     """
     check_white_level(white_level)
     equal = intensities is not None and str(intensities) == EQUAL
@@ -97,7 +103,14 @@ def open_capture(
         stamp = (*stamp, None if matrix_file is None else stamp_content(matrix_file))
         files = replace(files, images=tuple(image for image in files.images for _ in range(CHANNELS)))
     in_folder = files.images
-    files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    try:
+        files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    except InputError as error:
+        if channels is None or ", one for each image" not in error.problem:
+            raise
+        problem = error.problem.replace("one for each image", "three for each image")
+        hint = "With --lights-in-channels, the file needs three lines for each image, in the order R, G, B"
+        raise InputError(problem, path=error.path, hint=hint) from None
     warnings += files.warnings
     if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
         flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
@@ -125,7 +138,7 @@ def open_capture(
         warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
-        text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
+        text = f"{files.others[0].name}{more}: left out, because the name is not that of a photograph under one of"
         text += " the lights. To use it as one, list all images in filenames.txt."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
@@ -173,7 +186,14 @@ def read_capture(
     as_stored: bool = False,
     white_level: float | None = None,
 ) -> Capture:
-    """Open a capture with open_capture and read it with CaptureSource.read."""
+    """Open a capture with open_capture and read it with CaptureSource.read.
+
+    Examples:
+        >>> from splinecli.capture import read_capture
+        >>> capture = read_capture("examples/medallion", light_indices=[0, 2, 4])
+        >>> capture.observations.shape, capture.light_directions.shape
+        ((11836, 3), (3, 3))
+    """
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
     )
@@ -247,7 +267,7 @@ def _match_count(
         if found is None or int(found[1]) >= len(images):
             raise
         names = [image.name for image in images[int(found[1]) :]]
-        hint = f"In the order of the images, none is left for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        hint = f"In this order, it has none for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
         raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 

@@ -187,10 +187,10 @@ class Capture:
             raise InputError(f"{self.name}: a light direction is not a unit vector")
         if (lights[:, 2] <= 0).any():
             below = self.light_indices[int(np.argmax(lights[:, 2] <= 0))]
-            problem = f"{self.name}: light {below} lies below the horizon (z <= 0)"
+            problem = f"{self.name}: light {below} is below the horizon (z <= 0)"
             raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
-            problem = f"{self.name}: the {len(lights)} lights lie in one plane, so least squares (LS) cannot solve"
+            problem = f"{self.name}: the {len(lights)} lights are in one plane, so least squares (LS) cannot solve"
             raise InputError(f"{problem} for a normal", hint="Choose lights that surround the viewing direction")
 
     def _check_pixels(self) -> None:

@@ -40,7 +40,6 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.restoration.alignment import (
     LARGEST_MOTION,
-    LEAST_FIT,
     MIN_IMAGES,
     AlignedImages,
     align_images,
@@ -81,7 +80,7 @@ class CaptureSource:
     light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # the near lamps of files and options, or None
     camera_matrix: Float64Array | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
-    channels: ChannelLights | None = None  # if each channel of a colour image counts as an image of its own
+    channels: ChannelLights | None = None  # if each channel of a colour image is an image of its own
     window: Window = WHOLE  # the part of the images that is read. All masks but those in files have its size
     find_lights: LightFinder | None = None  # finds the lights from the images; then the directions mean nothing
     # JSON values that change when a file that is read for the capture, or the given white level, does. They are taken
@@ -91,6 +90,14 @@ class CaptureSource:
     @property
     def n_lights(self) -> int:
         return len(self.light_directions)
+
+    def image_names(self, indices: Sequence[int]) -> list[str]:
+        """Return the names of images for messages, with the channel if each channel is an image of its own."""
+        names, numbers = [self.files.images[index].name for index in indices], self.light_numbers
+        if self.channels is None:
+            return names
+        channels = ["RGB"[(index if numbers is None else numbers[index]) % 3] for index in indices]
+        return [f"{name} ({channel})" for name, channel in zip(names, channels, strict=True)]
 
     def places_of(self, light_numbers: Sequence[int] | None) -> Sequence[int] | None:
         """Return the indices of lights from their numbers in the light file. Raises UsageError."""
@@ -165,7 +172,7 @@ class CaptureSource:
         observations = observations[:n_pixels]
         warnings = [*self.warnings, *warnings]
         if upside_down:
-            text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
+            text = "The rows of the ground truth are in reverse order, so the map was flipped."
             warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
         warnings += [*of_lamps, *self.mask_warnings(mask, indices)]
@@ -213,50 +220,49 @@ class CaptureSource:
         names = [self.files.images[index].name for index in indices]
         if len(indices) < MIN_IMAGES:
             problem = (
-                f"--align needs {MIN_IMAGES} images or more, to predict each from the others; found {len(indices)}"
+                f"--align predicts each image from the others: found {len(indices)}, expected at least {MIN_IMAGES}"
             )
-            raise InputError(problem, path=self.files.folder, hint="Leave --align out, and align them elsewhere")
+            raise InputError(problem, path=self.files.folder, hint="Add images, or leave --align out")
         shape = common_size([self.facts[index] for index in indices])[0][:2]
         mask = self.read_mask(shape)
         stride = stride_for(len(indices) * mask.size)
-        pixels = self.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, progress)
-        images = np.stack([reduced(image.reshape(mask.shape), stride) for image in pixels])
+        read = self.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, progress)
+        images = np.stack([reduced(image.reshape(mask.shape), stride) for image in read])
         lights = None if self.find_lights is not None else self.light_directions[indices]
         found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)
         if found.unexplained is not None:
-            name, moved = names[found.unexplained], stride * self.window.step * found.moved_pixels[found.unexplained]
-            if found.largest > LARGEST_MOTION:
+            name, fit = names[found.unexplained], found.fits[found.unexplained]
+            if fit < found.least_fit:
                 problem = (
-                    f"--align found a motion of {moved:.0f} pixels for {name}, at one pixel {100 * found.largest:.0f} %"
-                    f" of the object's size; expected at most {100 * LARGEST_MOTION:.0f} %"
+                    f"--align cannot match {name} to the other images: at best, its correlation with their prediction"
+                    f" is {fit:.2f}, expected at least {found.least_fit:.2f}"
                 )
-                hint = (
-                    "Read a larger part of the images, leave the image out with --light-indices, or leave --align out"
-                )
+                hint = "Leave it out with --light-indices, mask the object, or leave --align out"
                 raise InputError(problem, path=self.files.folder, hint=hint)
+            pixels = stride * found.moved_pixels[found.unexplained]
             problem = (
-                f"--align cannot explain {name}: moved by {moved:.0f} pixels, its correlation with the prediction of"
-                f" the other images is {found.fits[found.unexplained]:.2f}, expected at least {LEAST_FIT}"
+                f"--align found that {name} moved by {pixels:.0f} pixels, at one pixel by {100 * found.largest:.0f} %"
             )
-            hint = "Leave it out with --light-indices, mask the object if others moved with it, or leave --align out"
+            problem += f" of the object's size; expected at most {100 * LARGEST_MOTION:.0f} %"
+            hint = "Read a larger part of the images, leave the image out with --light-indices, or leave --align out"
             raise InputError(problem, path=self.files.folder, hint=hint)
         left, top, *_ = self.window.box or (0, 0)
         transforms = np.repeat(np.eye(3)[None], self.n_lights, axis=0)
-        transforms[indices] = place_in_whole(found.transforms, left, top, self.window.step, stride)
+        transforms[indices] = place_in_whole(found.transforms, left, top, stride)
         common = self.window.of(common_pixels(transforms, shape))
         share = np.count_nonzero(mask & common) / np.count_nonzero(mask)
         if share < LEAST_COMMON:
-            problem = f"--align: the images share only {100 * share:.0f} % of the object"
-            raise InputError(problem, path=self.files.folder, hint="Leave out images that show another part of it")
-        moved = found.moved_pixels * stride * self.window.step
-        how = f"They moved by up to {moved.max():.1f} pixels ({found.model})"
-        if not (found.transforms != np.eye(3)).any():
-            how = "None moved by a tenth of a pixel, so they were left as they are"
-        elif share < 1:
-            how += f"; the {100 - 100 * share:.1f} % of the object that some of them do not show is left out"
-        warning = CaptureWarning(IMAGES_ALIGNED, f"The images were aligned to {names[0]}. {how}.")
+            problem = f"the aligned images share {100 * share:.0f} % of the object, expected {100 * LEAST_COMMON:.0f} %"
+            raise InputError(problem, path=self.files.folder, hint="Leave out the images that show another part of it")
+        moved, warnings = found.moved_pixels * stride, self.warnings
+        if (found.transforms != np.eye(3)).any():
+            text = f"The images were aligned to {names[0]}: they moved by up to {moved.max():.1f} pixels"
+            text += f" ({found.model})"
+            if share < 1:
+                text += f"; {100 - 100 * share:.1f} % of the object is left out, because it is not in every image"
+            warnings = (*warnings, CaptureWarning(IMAGES_ALIGNED, f"{text}."))
         aligned = AlignedImages(names[0], found.model, transforms, moved, common)
-        return replace(self, alignment=aligned, warnings=(*self.warnings, warning))
+        return replace(self, alignment=aligned, warnings=warnings)
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of the window on images of this shape. Raises InputError, also for a huge shape."""
@@ -349,7 +355,7 @@ class CaptureSource:
     def _aligned_reader(
         self, transforms: Float64Array, mask: Bools, like: str, wanted: Integers | slice, around: Bools | None
     ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
-        """Return what pixel_reader returns, of images that are moved back as a whole."""
+        """Return a reader like pixel_reader's, of images that are moved back as a whole."""
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
         read = linearise.pixel_reader(
             self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1)

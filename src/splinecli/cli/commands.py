@@ -34,7 +34,7 @@ def calibrate(options: CalibrateOptions) -> None:
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
     calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.
-    With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
+    With at least two balls, or one ball at two places, near lamps and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
     from splinecli.pipeline.calibrate import DIRECTIONS, calibrate_lights
@@ -62,7 +62,7 @@ def integrate(options: IntegrateOptions) -> None:
 def evaluate(options: EvaluateOptions) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 
-    All methods see the same draws. Captures are read as infer reads them; --as-stored reproduces published tables.
+    All methods use the same draws. Captures are read as infer reads them; --as-stored reproduces published tables.
 
     Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT, and a plot if you
     give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more

@@ -1,4 +1,4 @@
-"""`splinecli infer`, `watch` and `info`: captures in, normal maps out, or what to expect of them."""
+"""`splinecli infer`, `watch` and `info`: captures in, normal maps out, or a summary of the captures."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def infer(context: Context, options: InferOptions, batch: BatchOptions, cluster:
 
     Captures that are already done are skipped. If files or options of a capture have changed, infer reports it and
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
-    The exit code is that of the most serious failure.
+    The most serious failure determines the exit code.
     """
     from splinecli.pipeline.batch import infer_batch
 
     messages = Messages(quiet=batch.quiet)
     outcomes = infer_batch(
-        batch.captures,  # none of watch, which only wants the options to be checked
+        batch.captures,  # none for watch, which only checks the options
         options,
         messages,
         redo=batch.redo,
@@ -131,7 +131,7 @@ def watch(context: Context, options: WatchOptions) -> None:
     if len(given["captures"]) > 1:
         raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
     if output.resolve() == folder.resolve():
-        raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
+        raise UsageError("the results would be among the captures", path=output, hint="Give another -o OUT")
     given["captures"] = []
     infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=options.marker, seconds=options.settle, without=output)

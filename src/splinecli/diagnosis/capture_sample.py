@@ -46,6 +46,7 @@ class CaptureSample:
     linear: bool = True  # whether the values of the images are taken as linear
     truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
     strict: bool = False  # also warn of properties that the images leave undetermined
+    in_channels: bool = False  # whether each channel of a colour image has a light of its own
     copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
     background: float = 0.0  # the share of dark background that was left out of the sample
 
@@ -66,7 +67,7 @@ class CaptureSample:
             single = page_of(images[0])[0] == images[0] and source.channels is None
             copies = equal_files(images) if single else []
         return cls(
-            [image.name for image in images],
+            source.image_names(indices),
             source.light_directions,
             indices,
             sample,
@@ -82,6 +83,7 @@ class CaptureSample:
             linear=source.radiometry.curve == 1,
             truth=truth,
             strict=strict,
+            in_channels=source.channels is not None,
             copies=copies,
         )
 

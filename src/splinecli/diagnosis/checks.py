@@ -61,8 +61,8 @@ def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
         mended[:, place] /= factor
         how = f"{1 / factor:.0f} times darker" if factor < 1 else f"{factor:.0f} times brighter"
         text = (
-            f"{name} is {how} than the other images predict, as if its values had {16 - bits} bits and those of the"
-            f" others 16, or the other way round. Save all images in one way, or scale it by 2^{bits}."
+            f"{name} is {how} than the other images predict, as if it had {16 - bits} bits and the others 16, or"
+            f" vice versa. Save all images with the same bit depth, or scale it by 2^{bits}."
         )
         yield CaptureWarning(codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended))
 
@@ -71,16 +71,16 @@ def odd_image(seen: CaptureSample) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
-            text = f"{name} is black. Its lamp failed. Photograph it again, or leave it out."
+            text = f"{name} is black: its lamp probably failed. Photograph it again, or leave it out."
             return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [seen.names.index(name)]))]
     odd = seen.light_check.odd_image
     if odd is None or odd.place in [shift.place for shift in seen.shifts]:
         return []
     how = "" if odd.brightness is None else f" and is {odd.brightness:.2f} times as bright as they predict"
     text = (
-        f"{seen.names[odd.place]} contradicts the other images{how}: without it, {100 * odd.left:.0f} % of what"
-        " the lights cannot explain is left. Its lamp was moved or failed, its exposure differs, or a shadow fell on"
-        " the object. Photograph it again, or leave it out."
+        f"{seen.names[odd.place]} contradicts the other images{how}: leaving it out reduces the residual to"
+        f" {100 * odd.left:.0f} %. Its lamp may have moved or failed, its exposure may differ, or a shadow may have"
+        " fallen on the object. Photograph it again, or leave it out."
     )
     return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [odd.place]))]
 
@@ -96,17 +96,17 @@ def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
 
 def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
     if seen.background > 0.5:  # the share of near black pixels
-        text = f"{100 * seen.background:.0f} % of the pixels are near black. If they are background, their normals mean"
-        text += " nothing: add --auto-mask, or give a mask."
+        text = f"{100 * seen.background:.0f} % of the pixels are nearly black. If they are background, their normals"
+        text += " are meaningless: add --auto-mask, or give a mask."
         yield CaptureWarning(codes.NO_MASK, text)
 
 
 def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
     if spread < 0.1:  # see light_spread; such lights determine the normals poorly
-        where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
-        times = f"{1 / max(spread, 1e-3):.0f} times in the normals. Add lights from other sides."
-        text = f"The lights {where}, so noise and small errors of their directions grow about {times}"
+        where = "in a narrow cone" if in_cone else "nearly in one plane with the object"
+        text = f"All lights are {where}, which amplifies noise and errors of their directions by a factor of about"
+        text += f" {1 / max(spread, 1e-3):.0f} in the normals. Add lights from other sides."
         yield CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text)
 
 
@@ -134,8 +134,8 @@ def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
         return []
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (
-        f"The light directions are probably rough: others, {moved_deg.mean():.1f} degrees away on average, leave"
-        f" {100 * refined.fit_ratio:.0f} % of the misfit. Try --refine-lights."
+        f"The light directions are probably inaccurate: moving them by {moved_deg.mean():.1f} degrees on average"
+        f" reduces the residual to {100 * refined.fit_ratio:.0f} %. Try --refine-lights."
     )
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
@@ -155,9 +155,10 @@ def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[Capt
         if estimate_light_intensities(observations, None, seen.directions) is not None:
             return []  # `infer` estimates them, and reports it
     error_deg = seen.readings.error_deg(reading, seen.estimated)
-    left = f"what the lights cannot explain falls to {100 * reading.ratio:.0f} %"
+    left = f"the residual falls to {100 * reading.ratio:.0f} %"
     if seen.doubt.others:
-        left += f", but {' and '.join(_CAUSES[kind] for kind in seen.doubt.others)} would explain nearly as much"
+        causes = " and ".join(_CAUSES[kind] for kind in seen.doubt.others)
+        left += f", although {causes} would explain the images nearly as well"
     if reading.kind == "curve":
         text = (
             f"The images look display-encoded but are read as linear: if their values are decoded, {left}. Add"
@@ -193,7 +194,7 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     given = seen.intensities
     if given is None:
         return (
-            f"The lights look unequally bright: with other intensities, {left}. But the images do not determine them,"
+            f"The lights seem to differ in intensity: with other intensities, {left}. The images do not determine them,"
             " so equal ones are assumed. Measure them with calibrate --gray-card, or give them with --intensities FILE."
         )
     needed = np.log(given * reading.intensities)
@@ -207,15 +208,16 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     # A simple reading of the file leaves at most this share of the spread.
     how = f", for example {words}" if errors[words] < 0.4 * np.std(np.log(reading.intensities)) else ""
     return (
-        f"The light intensities that are given do not fit the images: with other ones{how}, {left}. Check that their"
+        f"The given light intensities do not fit the images: with others{how}, {left}. Check that their"
         " file is in the order of the images, or leave them out with --intensities equal."
     )
 
 
 def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
-    """Warn of fewer lights than eight."""
+    """Warn of fewer lights than eight, unless they are channels: one colour image has three."""
     count = len(seen.names)
-    return [CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")] * (count < 8)
+    few = count < 8 and not seen.in_channels
+    return [CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")] * few
 
 
 def lights_near_axis(seen: CaptureSample) -> list[CaptureWarning]:
@@ -263,7 +265,15 @@ CHECKS = [
 
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source; see check_sample."""
+    """Return warnings about a capture that was read from this source; see check_sample.
+
+    Examples:
+        >>> from splinecli.capture import open_capture
+        >>> from splinecli.diagnosis.checks import check_capture
+        >>> source = open_capture("examples/medallion")
+        >>> [warning.code for warning in check_capture(source, source.read())]
+        []
+    """
     samples, truth = _samples(capture), capture.ground_truth
     seen = CaptureSample.of_source(source, samples, capture.light_indices, truth=truth, strict=strict)
     return check_sample(replace(seen, estimated=capture.estimated_intensities))[1]

@@ -29,7 +29,7 @@ from splinecli.lights.rough_normals import RoughNormals, ShadowCheck, median_tur
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 
 # The advantage of a frame: the weight of a difference of rims, the smallest difference that distinguishes two frames,
-# and what lights rotated by any angle need, because the angle is fitted. From 1 on, a frame is better.
+# and the advantage that any rotation needs, because its angle is fitted. From 1 on, a frame is better.
 _RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 2.0
 
 
@@ -79,7 +79,7 @@ class LightCheck:
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
         elif not (self.outline_tells or self.shadows_tell):
-            missing.append("whether x and y are both negated (the mask's edge is no clear outline of the object)")
+            missing.append("whether x and y are both negated (the mask's edge is not a clear outline of the object)")
         return missing
 
     @property
@@ -98,7 +98,7 @@ def check_lights(
 ) -> LightCheck:
     """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of light_directions (N, 3).
 
-    `names` are those of the F images, for the words of the result, and `factors` those of the observations.
+    `names` are the names of the F images, for the texts of the result, and `factors` is find_factors(observations).
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
@@ -283,7 +283,7 @@ def light_warnings(check: LightCheck, light_file: Path, frame: LightFrame, stric
         # expected within 5 degrees.
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
     if strict and check.unchecked:
-        text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
+        text = f"The lights of {light_file.name} could not be fully verified. Unchecked: {'; '.join(check.unchecked)}."
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
     return warnings
 
@@ -326,12 +326,12 @@ def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_fil
         text += f" ({', '.join(figures)})"
     if best.is_order:
         return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
-    which = "They exchange hollows and bumps; without a closed outline, only you can tell which is right."
+    which = "They exchange bumps and hollows; without a closed outline, only the object itself shows which is right."
     if best.frame is None:
         return f"{text}. " + (f"Rotate the light directions, as {_WRITES_MENDED} does." if twin is None else which)
     advice = f"{text}: run again with --light-frame {best.frame.after(frame)}"
     if twin is not None and twin.frame is not None:
         return f"{advice} or {twin.frame.after(frame)}. {which}"
     if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
-        advice += ". If the object is hollow up to its outline, as the inside of a bowl, the lights are right"
+        advice += ". If the object is hollow up to its outline, like the inside of a bowl, the lights are right"
     return f"{advice}."

@@ -204,7 +204,7 @@ def check_order(
 ) -> LightOrder:
     """Return the order of the `chosen` lights (F,) of light_directions (N, 3) that fits observations (P, F) best.
 
-    `factors` are those of the observations; None if too few are lit. All lights are shifted and reversed together.
+    `factors` is find_factors(observations), None if too few are lit. All lights are shifted and reversed together.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))
@@ -300,7 +300,7 @@ def _best_exchange(factors: Factors, lights: Float64Array, names: Sequence[str])
     misfits = factors.misfits(lights[swaps])
     best = int(misfits.argmin())
     one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
-    return _Reading(f"with those of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
+    return _Reading(f"with the lights of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
 
 
 def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Float64Array) -> bool:

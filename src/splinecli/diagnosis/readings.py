@@ -65,7 +65,7 @@ class _Fit:
 class Readings:
     """The pixels of a sample, whose observations are as stored, and the readings that were fitted to them.
 
-    `lights` are (F, 3), unit; `intensities` (F,) those that were measured, or None for equal ones. `eight_bit` tells
+    `lights` are (F, 3), unit; `intensities` (F,) were measured, or are None for equal ones. `eight_bit` is
     whether the images have 8 bits and do not state that they are linear.
     """
 

@@ -154,7 +154,7 @@ class CaptureSummary:
         text = f"Images that use less than {100 * DARK:.0f} % of the range: {len(dark)}, such as {dark[0].path.name};"
         text += " a longer exposure gives less noise"
         # One dark image among others may have been stored in another way.
-        text += "." if len(dark) > len(self.images) / 2 else ", if the values have as many bits as those of the others."
+        text += "." if len(dark) > len(self.images) / 2 else ", if it has the same bit depth as the others."
         return CaptureWarning(codes.DARK_IMAGES, text)
 
 

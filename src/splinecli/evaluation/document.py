@@ -68,7 +68,7 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     first = evaluations[0].protocol
     lights = dict.fromkeys(f"{lights_value(e.protocol)} lights" for e in evaluations)
     noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
-    drawn = "at random from the seed" if first.draws_file is None else f"those of {first.draws_file.name}"
+    drawn = "at random from the seed" if first.draws_file is None else f"as in {first.draws_file.name}"
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
     left_out = ", ".join(
         f"the first {count} of {'every other capture' if name == protocol_module.EVERY_CAPTURE else name}"

@@ -180,8 +180,8 @@ def capture_figures(
 
     The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near lamps or with a
     camera matrix. All pixels in the mask are estimated, even if the protocol has max_pixels. `name` is the capture's in
-    the tables, and `stem` that of the files. `advance` is called with the fraction of the work just completed. Raises
-    InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
+    the tables, and `stem` is the stem of the files. `advance` is called with the fraction of the work just completed.
+    Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)

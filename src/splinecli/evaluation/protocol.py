@@ -30,8 +30,8 @@ def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials:
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        hint = f"Ask for at most {available} lights"
-        raise UsageError(f"{n_lights} lights were requested, but the capture has {available}", hint=hint)
+        hint = f"Use --n-lights {available}, or fewer"
+        raise UsageError(f"the capture has {available} lights, too few for draws of {n_lights}", hint=hint)
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -72,7 +72,7 @@ class DrawsFile:
             elif min(draw) < skipped:
                 problem = f"found light index {min(draw)}; the first {skipped} images are to be skipped"
             elif in_one_plane(light_directions[list(draw)]):
-                problem = "the lights of this draw lie in one plane, so no normal can be found"
+                problem = "the lights of this draw are in one plane, so no normal can be found"
             else:
                 continue
             raise InputError(problem, path=self.path, line=line)
@@ -104,7 +104,7 @@ def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) 
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    problem = f"found no {n_lights} lights that do not lie in one plane in 1000 draws"
+    problem = f"all of 1000 draws of {n_lights} lights are in one plane"
     raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
 
 

@@ -21,7 +21,7 @@ from splinecli.results.material import material_of
 
 
 def relight_first_draw(folder: Path, name: str, estimator: Estimator, protocol: Protocol) -> RelightingReport:
-    """Return the relighting of a capture from the protocol's first draw. Raises what `relight` and reading raise."""
+    """Return the relighting of a capture from the protocol's first draw. Raises SplinecliError."""
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)
     trial = Trial(name, estimator.name, 0, draws_for(source, name, read, draws_file)[0], read, "")
@@ -39,16 +39,16 @@ def relight(given: Capture, whole: Capture, estimator: Estimator, *, name: str) 
         name: name of the capture in the tables.
 
     Raises:
-        UsageError: no light is left, or the lamps or the camera are near.
+        UsageError: the draw uses all lights, or the lamps or the camera are near.
         InputError: too few lights are used.
     """
     from splinecli.materials.maps import lights_that_reach, render_gray
 
     held = [place for place, light in enumerate(whole.light_indices) if light not in given.light_indices]
     if not held:
-        raise UsageError(f"{name}: no light is held out", hint="Use fewer --n-lights")
+        raise UsageError(f"{name}: the draw uses all lights, so none is held out", hint="Use a smaller --n-lights")
     if whole.lamps is not None or whole.camera_matrix is not None:
-        raise UsageError(f"{name}: relighting needs distant lights and an orthographic camera")
+        raise UsageError(f"{name}: --relight needs distant lights and an orthographic camera")
     estimate = estimate_normals(given, estimator)
     normals = estimate.normal_map[given.mask]
     confidence = None if estimate.confidence_map is None else estimate.confidence_map[given.mask]
@@ -70,7 +70,7 @@ def relight(given: Capture, whole: Capture, estimator: Estimator, *, name: str) 
 def likeness(photographs: Float32Array, pictures: Float32Array) -> Likeness:
     """Compare pictures with photographs, both (P, F) and linear. The photographs are not all black.
 
-    White is the 0.999 quantile of the photographs; brighter values count as white.
+    White is the 0.999 quantile of the photographs; brighter values are clipped.
     """
     white = max(float(np.quantile(photographs, 0.999)), 1e-12)
     wrong = np.minimum(pictures, white) - np.minimum(photographs, white)

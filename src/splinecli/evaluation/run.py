@@ -174,7 +174,7 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     """Return the folders, without duplicates, with the names of the captures.
 
-    If two names are equal, or one is that of the average in the tables, all are the last parts of their paths.
+    If two names are equal, or one is the name of the average in the tables, all are the last parts of their paths.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]

@@ -127,7 +127,7 @@ class TwoHalves(NamedTuple):
 
 
 def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
-    """Fit all lights, and compare two halves of them.
+    """Fit all lights, and compare the fits of two halves.
 
     The observations (P, F) of each pixel are scaled to a largest value of 1, and the light directions (F, 3) or
     (P, F, 3) are unit, all in float64. The signs (F,) are 1 and -1 for the two halves, the same for all pixels of a

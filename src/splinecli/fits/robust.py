@@ -102,7 +102,7 @@ def fit_robustly(
     """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
 
     Each pixel's values (P, F) are scaled to a largest value of 1. The weights `lit` (P, F) do not depend on the fit,
-    for example from shadow_weights; `weights` are those of the first fit, by default `lit`. The lights (F, 3) or (P, F,
+    for example from shadow_weights; `weights` are for the first fit, by default `lit`. The lights (F, 3) or (P, F,
     3) have any length, and the number of weighted fits is at least 1.
     """
     weights = lit if weights is None else weights

@@ -200,7 +200,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        reason = "no others near them fit the images much better"
+        reason = "no directions near them fit the images much better"
         if capture.n_lights < MIN_LIGHTS:
             reason = f"there are fewer than {MIN_LIGHTS} lights"
         elif _choose_pixels(capture.observations) is None:
@@ -212,8 +212,8 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         intensities = found.intensities if intensities is None else intensities * found.intensities
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
     text = (
-        f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
-        f" {moved_deg.max():.1f}. The images fit them better: {100 * found.fit_ratio:.0f} % of the misfit is left."
+        f"The light directions were refined: they moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}, which reduces the residual to {100 * found.fit_ratio:.0f} %."
     )
     return replace(
         capture,
@@ -290,8 +290,8 @@ def fit_near(
     """Return the lights near the given ones that fit the images best; None for too few lights or lit pixels.
 
     The observations (P, F) are linear, and the directions (F, 3) are unit. `error_deg` is the usual error of each
-    direction (F,), or of all; `intensity_error` that of intensities of 1, a share; 0 if they are known. `worth_pixels`
-    is the number of pixels that the images weigh against the prior, because errors of a matte model are alike in many.
+    direction (F,), or of all; `intensity_error` is a share, 0 for known intensities. `worth_pixels` is the
+    number of pixels that the images weigh against the prior, because errors of a matte model are alike in many.
     """
     values = _choose_pixels(observations)
     if values is None:

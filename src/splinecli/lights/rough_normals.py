@@ -131,7 +131,7 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
     normals[mask] = unit(vectors)
     smooth = gaussian_filter(normals, (SMOOTHING, SMOOTHING, 0))
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
-    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")  # the border of the image is no rim
+    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")  # the border of the image is not a rim
     if padded.all():
         return RoughNormals(smooth, mask, np.zeros((*mask.shape, 2)))
     inner = slice(RIM_PIXELS + 1, -RIM_PIXELS - 1)

@@ -146,7 +146,7 @@ def turn_at_outline(observations: Float32Array, mask: Bools, light_directions: F
     for _ in range(25):
         turned = turn.apply(normals)
         # A small rotation w adds w x n. The first residual is along the view axis, the second along the outline.
-        # Normals within a pixel of the outline have a z of about 0.25, as pixels have a size and masks lie inside.
+        # Normals within a pixel of the outline have a z of about 0.25, because pixels have a size and masks end inside.
         residuals = np.stack((turned[:, 2] - 0.25, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
         weights = 1 / (np.abs(residuals) + 0.1)
@@ -271,8 +271,8 @@ def find_lights(
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
-            f"the lights cannot be told from the images: their expected error is {expected:.0f} degrees, and at most"
-            f" {LARGEST_ERROR_DEG:.0f} is of use",
+            f"the images do not determine the lights: their estimated error is {expected:.0f} degrees, expected at most"
+            f" {LARGEST_ERROR_DEG:.0f}",
             hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
             " lights with 'splinecli calibrate'",
         )

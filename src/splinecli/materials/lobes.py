@@ -85,14 +85,14 @@ def facet_lobe(geometry: Geometry, roughness: Tensor, tail: Tensor) -> Tensor:
 
 _RELATIVE, _DEGREES_OF_FREEDOM = 0.05, 3.0
 _MOST_LOBE_ERROR = 0.6
-"""The errors of observations: a share of what is expected, with the tails of Student's distribution. A sharp lobe also
+"""The errors of observations: a share of the prediction, with the tails of Student's distribution. A sharp lobe also
 changes with the normals' errors, at most by the last share of itself."""
 
 _STEPS = 4  # of the robust fit of a base
 
 
 class Sample(NamedTuple):
-    """Observations and the facts that the fit needs about them."""
+    """Observations with their geometry and errors."""
 
     observations: Tensor  # (P, F)
     geometry: Geometry
@@ -117,7 +117,7 @@ def fit_base(
         slope, offset: (P, F).
         of_facets: (P, F), the part of the slope that the facets have.
         lobe_error: (P, 1), from lobe_error.
-        expected: decides where a pixel does not show its base. None for nothing.
+        expected: determines the base where the observations do not. None for no expectation.
     """
     pull = pulled = torch.zeros(1, 1)
     if expected is not None:
@@ -142,7 +142,7 @@ def lobe_error(geometry: Geometry, roughness: Tensor) -> Tensor:
 
 
 def predict_left_out(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
-    """Return what base * slope + offset, fitted to all observations (P, F) but one, predicts for this one."""
+    """Return the predictions (P, F) of base * slope + offset, each fitted to the other observations of its pixel."""
     above, below = weights * slope * (sample.observations - offset), weights * slope**2
     others = below.sum(1, keepdim=True) - below
     base = ((above.sum(1, keepdim=True) - above) / others.clamp(min=1e-12)).clamp(min=0)

@@ -47,7 +47,7 @@ _MOST_CELLS = 40_000  # shadows of larger maps are computed for every second, th
 
 @dataclass(frozen=True, eq=False)
 class MaterialMaps:
-    """The material of the P pixels of a mask, in glTF's parameters, and what pictures of it need in addition.
+    """The material of the P pixels of a mask, in glTF's parameters, and further values for pictures.
 
     base_colour: (P, 3) linear RGB; all channels are equal for gray images. The exposure of photographs is unknown, so
         the scale is chosen such that dielectrics reflect 4 % on average, but never so that the brightest bases exceed
@@ -167,7 +167,7 @@ def render_gray(
 def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
     """Return which distant lights (F, 3) reach the P pixels of the mask (H, W): (P, F), without attached shadows.
 
-    The shadows are those of the integrated normals (H, W, 3), for an orthographic camera.
+    The shadows are cast by the surface of the normals (H, W, 3), for an orthographic camera.
     """
     step = max(1, ceil(sqrt(np.count_nonzero(mask) / _MOST_CELLS)))
     coarse = mask[::step, ::step]

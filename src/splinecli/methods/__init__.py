@@ -44,6 +44,11 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
     Methods that run in PyTorch limit its threads to the cores that the process may use; see
     splinecli.system.machine.use_available_cores. Raises UsageError if the name, the device or a number is not valid,
     ModelError if the weights cannot be used.
+
+    Examples:
+        >>> from splinecli.methods import make_estimator
+        >>> make_estimator("ls").name
+        'ls'
     """
     check_method(name)
     return METHODS[name].make(name, options)

@@ -75,7 +75,7 @@ class NetworkConfig:
     refines_twice: bool = False  # whether a second refinement net follows the first
     set_width: Annotated[int, Meta(ge=0, le=4096)] = 0  # channels of the set branch, 0 for none. Compact size only.
     set_layers: Depth = 3  # attention layers of the set branch
-    sees_capture: bool = False  # whether pixels see a sample of their capture. Needs a set branch.
+    sees_capture: bool = False  # whether a sample of the capture is an input of each pixel. Needs a set branch.
 
     @property
     def is_canonical(self) -> bool:

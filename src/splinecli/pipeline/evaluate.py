@@ -89,7 +89,8 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
-            raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
+            problem = f"the captures have at most {most} lights, too few for draws of {protocol.n_lights}"
+            raise UsageError(problem, hint=f"Use --n-lights {most}, or fewer")
 
 
 def _draw_figures(

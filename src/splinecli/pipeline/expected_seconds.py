@@ -1,13 +1,16 @@
-"""The seconds that `infer` is expected to take for each stage of a capture: for its progress bar, and for `info`.
+"""The expected seconds of each stage of `infer` for a capture: for its progress bar, and for `info`.
 
 The costs were measured on two cores, with native bfloat16 and with AVX2 alone (benchmarks/large_captures.py). Other
 processors may differ from them by a factor of two.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
 from splinecli.methods.estimator import student_sizes
+from splinecli.output_files import OutputMap
+from splinecli.restoration.alignment import MOST_VALUES
 from splinecli.system.machine import count_available_cores
 
 AUTOMATIC_FROM = 100_000
@@ -34,10 +37,19 @@ _FLOAT32 = _Costs(1.8e-7, 4.0e-4, 2.2e-6, 9.0e-5, 1.3e-6, 2.0e-3, 3e-7)  # AVX2
 _OTHER_METHODS = 4e-5  # per pixel
 _UNLIKE = 0.005  # share of pixels that the network estimates beside a distilled estimator
 _INDIRECT = 0.3  # share of the pixels that are usually estimated again
+_MATERIAL = 2.5  # nearly independent of the number of pixels
+_ALIGN, _ALIGN_ROOT = 1.0, 7e-3  # plus this times the square root of the values of all images
 
 
 def expected_seconds(
-    n_pixels: int, n_images: int, image_pixels: int, *, network: bool = True, distils: bool | None = None
+    n_pixels: int,
+    n_images: int,
+    image_pixels: int,
+    *,
+    network: bool = True,
+    distils: bool | None = None,
+    align: bool = False,
+    maps: Collection[OutputMap] = (),
 ) -> dict[str, float]:
     """Return the expected seconds of each stage on this machine; see `Clock`.
 
@@ -46,11 +58,16 @@ def expected_seconds(
         image_pixels: number of pixels of each image.
         network: whether the method is spline-net, and not a fit.
         distils: whether a distilled estimator is used. None decides by AUTOMATIC_FROM.
+        align: whether the images are aligned, for which they are read twice.
+        maps: the maps that are also written.
     """
     cores = min(count_available_cores(), 8)
     costs = _BFLOAT16 if _has_bfloat16() else _FLOAT32
     read = costs.read * image_pixels * n_images / min(cores, 2)
-    found = {"read": read, "check": 1.5, "write": costs.write * n_pixels}
+    pictures = read * any(row.reads_images for row in maps) + _MATERIAL * any(row.name == "material" for row in maps)
+    found = {"read": read, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
+    if align:
+        found["read"] += read + _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
     if not network:
         return {**found, "estimate": _OTHER_METHODS * n_pixels / cores}
     if n_pixels >= AUTOMATIC_FROM if distils is None else distils:

@@ -50,7 +50,7 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
             problem = "contains the frames of another film, or of an earlier version of this one"
-            hint = "Add --update to take those of this film, or choose another place with -o"
+            hint = "Add --update to extract the frames of this film, or choose another place with -o"
             raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)

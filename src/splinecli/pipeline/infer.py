@@ -189,6 +189,14 @@ def infer_capture(
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from splinecli.pipeline.infer import infer_capture
+        >>> from splinecli.pipeline.infer_options import InferOptions
+        >>> report = infer_capture(Path("examples/medallion"), InferOptions(method="ls", output="results"))
+        >>> report["n_pixels"]
+        11836
     """
     name = capture_name(folder)
     with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
@@ -268,7 +276,10 @@ def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> t
         indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
     height, width, *_ = source.facts[0].size[0]
-    seconds = partial(expected_seconds, n_images=count, image_pixels=height * width, network=network)
+    maps = chosen_maps(options.maps, page=options.html)
+    seconds = partial(
+        expected_seconds, n_images=count, image_pixels=height * width, network=network, align=options.align, maps=maps
+    )
     clock.expect(seconds(height * width, distils=options.distil))
     for_mask = source.n_lights * options.auto_mask  # images that are read to find the object, also after aligning
     advance = clock.begin("read", (count + for_mask) * (1 + options.align), "reading")

@@ -29,6 +29,7 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
 from splinecli.records import FileName, NotNegative, Option, Positive, Record, Seed
+from splinecli.restoration.alignment import MIN_IMAGES
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file
@@ -53,13 +54,13 @@ DISCONTINUITY_HELP = "Discontinuity sensitivity of the surface; 0 gives a contin
 
 AsStored = Annotated[bool, Option("Input", "",
     "Use the stored values: do not remove lens blur, restore saturated pixels or estimate light intensities.")]
-WhiteLevel = Annotated[Positive | None, Option("Input", "N", "Stored value from which a pixel counts as saturated.",
+WhiteLevel = Annotated[Positive | None, Option("Input", "N", "Stored value from which a pixel is considered saturated.",
     default="found in the images")]
 RandomSeed = Annotated[Seed, Option("Lights", "S", "Seed of the random draws.")]
 RefineLights = Annotated[bool, Option("Lights", "",
     "Refine rough light directions so that they fit the images better.")]
 Weights = Annotated[str | None, Option("Method", "NAME|FILE", "Weights: a shipped name or a file.",
-    default="those of the method", complete=complete_weights)]
+    default="the method's own", complete=complete_weights)]
 DeviceName = Annotated[Device, Option("Speed", "",
     "Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")]
 PrecisionName = Annotated[Precision, Option("Speed", "",
@@ -88,8 +89,8 @@ class Workers(Record, frozen=True, kw_only=True):
     """The number of local processes that work on the items of a command; 0 means as many as the machine can use."""
 
     workers: Annotated[int, Option("Processes and machines", "N|auto",
-        "Number of processes of this machine that work side by side (needs the extra 'cluster'). auto chooses by cores"
-        " and memory.", parse=parse_workers)] = 1
+        "Number of parallel processes on this machine (needs the extra 'cluster'). auto chooses by cores and memory.",
+        parse=parse_workers)] = 1
 
 
 class ClusterOptions(Workers, frozen=True, kw_only=True):
@@ -155,7 +156,7 @@ class Reading(Record, frozen=True, kw_only=True):
         " azimuth, counter-clockwise from the right. Needed if the images show no outline of the object.",
         complete=tuple(SIDES_DEG))] = None
     light_frame: Annotated[str | None, Option("Lights", "LIST",
-        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y stands before x).",
+        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes before x).",
         default="x right, y up, z to the camera",
         complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)))] = None
     light_format: Annotated[LightForm, Option("Lights", "",
@@ -168,7 +169,7 @@ class Reading(Record, frozen=True, kw_only=True):
         "The channels of each colour image are photographs under three coloured lamps; the light file has three lights"
         " for each image, in the order R, G, B. For gray objects.")] = False
     crosstalk: Annotated[FileName | None, Option("Lights", "FILE",
-        "With --lights-in-channels: 3 x 3 responses, line by line those of the channels R, G, B to the lamps.",
+        "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the channels R, G, B.",
         default="crosstalk.txt in CAPTURE, or none")] = None
     light_positions: Annotated[FileName | None, Option("Lights", "FILE",
         "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
@@ -178,7 +179,7 @@ class Reading(Record, frozen=True, kw_only=True):
     pixel_size: Annotated[Positive | None, Option("Lights", "S", "Near lamps: the width of a pixel on the object.",
         default="pixel_size.txt in CAPTURE")] = None
     object_width: Annotated[Positive | None, Option("Lights", "W",
-        "Near lamps: the width of the object in its mask, in place of --pixel-size.")] = None
+        "Near lamps: the width of the object in its mask, instead of --pixel-size.")] = None
     camera_matrix: Annotated[FileName | None, Option("Lights", "FILE",
         "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is then estimated in the"
         " frame of its viewing ray.", default="camera_matrix.txt in CAPTURE, or orthographic")] = None
@@ -334,6 +335,11 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         super().__post_init__()
         if self.n_lights is not None and self.light_indices is not None:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
+        count = self.n_lights if self.light_indices is None else len(self.light_indices)
+        if self.align and count is not None and count < MIN_IMAGES:
+            option = "--n-lights" if self.light_indices is None else "--light-indices"
+            problem = f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}"
+            raise UsageError(problem, hint="Use more lights, or leave --align out")
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         if self.finds_lights and self.refine_lights:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from splinecli.calibration.balls import find_view
+from splinecli.capture.channel_lights import CHANNELS
 from splinecli.capture.formats.images import common_size
 from splinecli.capture.light_files import check_writable, encode_lights
 from splinecli.capture.record import FoundLights
@@ -57,7 +58,7 @@ def describe_capture(
                 source = align(source, None, lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-                problem = f"the plot {plot} would be in the folder of the images and count as an image of the capture"
+                problem = f"the plot {plot} would be in the folder of the images and be read as an image of the capture"
                 raise UsageError(problem, hint="Choose another folder for it")
             check_free(plot.parent, [plot.name], overwrite=options.overwrite)
         if mended_lights is not None:
@@ -117,10 +118,11 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     if estimated is not None and estimated["intensities"] is not None:
         intensities = "estimated from the images"
     exposure, level = report["exposure"], report["white_level"]
+    named = (report["first_image"], report["last_image"])
     dark, bright = exposure["bright"]
     rows = [
         ("capture", f"{report['capture']} ({report['layout']})"),
-        ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
+        ("images", f"{report['images']} ({' ... '.join(dict.fromkeys(named))}): {kinds}"),
         ("lights", lights),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
         *([("camera", camera)] if (camera := _camera_in_words(report)) else []),
@@ -148,7 +150,7 @@ def _camera_in_words(report: dict[str, Any]) -> str | None:
     if of_exif is None:
         return None
     rows = ", ".join(" ".join(f"{number:.6g}" for number in row) for row in of_exif)
-    return f"counts as orthographic; EXIF suggests a --camera-matrix with the rows {rows}"
+    return f"treated as orthographic; EXIF suggests a --camera-matrix with the rows {rows}"
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
@@ -166,7 +168,7 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
         lines.append(f"{row['reading']:{width}}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
     return [
         *lines,
-        "misfit: what the reading leaves of the images, as a share of what random orders leave; it judges orders",
+        "misfit: residual of the images, relative to lights in random order; it judges orders",
         "advantage: evidence from curl and outline, against the file as given; from 1 on it gives a warning",
     ]
 
@@ -186,11 +188,13 @@ def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLi
 
 def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
     source, files, level = summary.source, summary.source.files, summary.white_level
-    kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
+    channels = None if source.channels is None else CHANNELS
+    kinds = sorted({(*image.shape[1::-1], channels or image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
     first = summary.images[0]
-    stages = expected_seconds(summary.n_pixels, len(summary.images), first.shape[0] * first.shape[1])
+    size = first.shape[0] * first.shape[1]
+    stages = expected_seconds(summary.n_pixels, len(summary.images), size, align=source.alignment is not None)
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
@@ -203,10 +207,10 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     return {
         "capture": files.name,
         "layout": files.layout,
-        "images": len(summary.images),
+        "images": len({image.path for image in summary.images}),  # each is there for every channel that is a light
         "first_image": first.path.name,
         "last_image": summary.images[-1].path.name,
-        "image_kinds": [{"size": [w, h], "channels": channels, "type": dtype} for w, h, channels, dtype in kinds],
+        "image_kinds": [{"size": [w, h], "channels": count, "type": dtype} for w, h, count, dtype in kinds],
         "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,
         "light_directions": text(files.light_directions),

@@ -133,7 +133,7 @@ def make_surface(
 
 
 def _stretched(normal_map: NDArray[np.float32], mask: NDArray[np.bool_], aspect: float) -> NDArray[np.float32]:
-    """Return the normals of a surface whose height per row of pixels is that of square pixels."""
+    """Return the normals of a surface that has the same heights on square pixels."""
     stretched = np.zeros_like(normal_map)
     stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))
     return stretched
@@ -248,6 +248,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         report["folder"] = str(options.folder.absolute())
         report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
+    if report["level"] is not None:
+        observer.say(f"The surface was levelled by {report['level']['tilt_deg']:.2f} degrees")
     return report
 
 

@@ -115,7 +115,7 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     pixel_size: Annotated[Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None,
         Option("Input", "MM",
         "Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres.",
-        default="that of infer --surface, by report.json beside the normal map, or in pixels")] = None
+        default="as given to infer --surface by report.json beside the normal map, or none")] = None
     pixel_aspect: Annotated[Annotated[float, Meta(ge=0.01, le=100)], Option("Input", "A",
         "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled images.")] = 1.0
     convention: Annotated[Convention | None, Option("Input", "",
@@ -134,9 +134,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     largest_step: Annotated[NotNegative | None, Option("Method", "PIXELS",
         "Leave out triangles whose corners differ by more than this height.", default="keep all")] = None
     level: Annotated[tuple[tuple[int, int], ...] | None, Option("Method", "plane|POINTS",
-        "Level the surface, and write its normals: plane removes the slope of the plane that most pixels are near;"
-        ' three or more pixels "X,Y X,Y X,Y" are on a plane that becomes level.', parse=parse_level)] = None
-    output: Annotated[Path | None, Option("Output", "OUT", "Folder of the results.", default="that of NORMALS",
+        "Level the surface, and write its normals: plane removes the slope of its dominant plane; three or"
+        ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.', parse=parse_level)] = None
+    output: Annotated[Path | None, Option("Output", "OUT", "Folder of the results.", default="the folder of NORMALS",
         names=OUTPUT)] = None
     formats: Annotated[tuple[str, ...], Option("Output", "LIST",
         f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or as a 16-bit"
@@ -212,7 +212,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         "Number of lights in each draw. May be repeated.", default=str(DEFAULT_LIGHTS), parse=parse_light_count,
         repeated=True)] = ()
     trials: Annotated[Count | None, Option("Lights", "T", "Number of random draws.",
-        default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} of four methods or more")] = None
+        default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more")] = None
     seed: shared.RandomSeed = 0
     draws: Annotated[FileName | None, Option("Lights", "FILE",
         "Draws of lights: each line has light indices, counted from 0.")] = None

@@ -135,11 +135,11 @@ def _problems(entry: Any) -> Iterator[str]:
     if not all(isinstance(entry.sha256.get(array), str) for array in ARRAYS):
         yield "an entry is incomplete (a checksum is missing)"
     if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
-        yield "a count of an entry is no whole number above 0"
+        yield "a count of an entry is not a whole number above 0"
     if not isinstance(entry.recipe, dict):
-        yield "the recipe of an entry is no table"
+        yield "the recipe of an entry is not a table"
     if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
-        yield "the name, scene or source of an entry is no text"
+        yield "the name, scene or source of an entry is not a text"
     if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
         yield f"{entry.name!r} is not the name of a folder"
 

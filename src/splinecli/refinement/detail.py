@@ -131,8 +131,8 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
     clearly larger than its noise, and to the extent that both agree. Images that are shifted towards their lights, by
     half a pixel for example, have the same effect as detail.
 
-    All normals (3, H, W) are unit; at least FEWEST_LIGHTS lights gave those of least squares, and the noise (1, H, W)
-    is theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0, and the other maps are zero outside,
+    All normals (3, H, W) are unit. The least squares had at least FEWEST_LIGHTS lights, and the noise (1, H, W) is
+    theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0, and the other maps are zero outside,
     as is the result. Black pixels stay as they are.
     """
     mask = mask * least_squares.any(dim=0)  # black pixels carry no information

@@ -1,10 +1,10 @@
 """Register images that moved between exposures, without being misled by the changing light.
 
-All images are compared with what a matte surface shows under their lights, I = l . b, so that the light's effect on the
+All images are compared with a matte surface under their lights, I = l . b, so that the light's effect on the
 images is part of the model. The transforms, and small corrections of the lights, minimise the robust residuals of this
 model jointly, by Gauss-Newton steps in which every pixel's b is eliminated (variable projection). This is the batch
 alignment of Y. Peng, A. Ganesh, J. Wright, W. Xu, Y. Ma, "RASL: Robust alignment by sparse and low-rank decomposition",
-TPAMI 2012, with the known lights in place of an unknown subspace. The images are high-pass filtered, which keeps the
+TPAMI 2012, with the known lights instead of an unknown subspace. The images are high-pass filtered, which keeps the
 model linear and removes most of the gloss. The first shifts come from correlations of the gradients of images with
 similar lights.
 """
@@ -29,7 +29,11 @@ MIN_IMAGES = 5
 MOST_VALUES = 40_000_000
 """Images are reduced until they have at most so many pixels together: 160 MiB."""
 
-LEAST_FIT = 0.6  # correlation of an aligned image with its prediction; 0.75 and more on objects with any detail
+LEAST_FIT, CLEAR_FIT, MOST_UNLIKE = 0.3, 0.8, 3.0
+"""An image does not fit if its correlation with its prediction from the others is below CLEAR_FIT, and farther from 1
+than the median correlation by the factor MOST_UNLIKE, because images with little detail fit badly, but alike. A median
+below LEAST_FIT leaves nothing to align by: it is 0.05 to 0.25 on a real ball, and 0.44 to 0.95 on two statues."""
+
 LARGEST_MOTION = 0.35  # of a pixel, as a share of the object's longer side
 UNMOVED = 0.1  # pixels; a capture in which no image moved by more is left as it is
 
@@ -39,7 +43,7 @@ _NEIGHBOURS = 8  # images with similar lights that each image is compared with f
 _HIGH_PASS, _LOW_PASS = 3.0, 0.7  # standard deviations in pixels
 _MOST_OBSERVATIONS = 600_000  # on a level
 _LIGHT_SIGMA, _BRIGHTNESS_SIGMA = 0.05, 0.3  # expected relative errors of the given lights
-_CORRELATED = 300.0  # neighbouring residuals are alike: so many count as one, when they are weighed against a prior
+_CORRELATED = 300.0  # neighbouring residuals are correlated: so many weigh as much as one against a prior
 _RIDGE = 0.02  # share of a pixel's weights, pulls its b to zero
 _SMALLEST_ENERGY, _CUT = 1e-3, 2.0  # of a pixel's features, and residual with half of the weight, see _Fit
 _DARK, _SHADOW_WEIGHT = 0.1, 0.05
@@ -49,11 +53,11 @@ _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by thi
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How images moved against the first of them, in pixels: x is the column, y the row.
+    """How images moved against the first one, in pixels: x is the column, y the row.
 
     transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each image.
     moved_pixels: (F,), the root mean square motion over the object.
-    fits: (F,), the correlation of the aligned image with its prediction from all images.
+    fits: (F,), the correlation of the aligned image with its prediction from the others.
     """
 
     model: Model
@@ -66,9 +70,15 @@ class Alignment:
     def unexplained(self) -> int | None:
         """The place of an image that fits the others nowhere, or None."""
         worst = int(self.fits.argmin())
-        if self.largest > LARGEST_MOTION:
-            return int(self.moved_pixels.argmax())
-        return worst if self.fits[worst] < LEAST_FIT else None
+        if self.fits[worst] < self.least_fit:
+            return worst
+        return int(self.moved_pixels.argmax()) if self.largest > LARGEST_MOTION else None
+
+    @property
+    def least_fit(self) -> float:
+        """The correlation that is expected of each image."""
+        usual = float(np.median(self.fits))
+        return LEAST_FIT if usual < LEAST_FIT else min(CLEAR_FIT, 1 - MOST_UNLIKE * (1 - usual))
 
 
 def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Alignment:
@@ -113,7 +123,7 @@ def _described(model: Model, transforms: Float64Array, mask: Bools, fits: Float6
 
 
 def common_pixels(transforms: Float64Array, shape: Sequence[int]) -> Bools:
-    """Return which pixels (H, W) of the reference lie inside all images of this shape (H, W)."""
+    """Return which pixels (H, W) of the reference are inside all images of this shape (H, W)."""
     height, width = shape
     rows, columns = np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)
     common = np.ones((height, width), np.bool_)
@@ -174,10 +184,10 @@ def reduced(image: Float32Array, stride: int) -> Float32Array:
     return np.asarray(squares.mean(axis=(1, 3)), np.float32)
 
 
-def place_in_whole(transforms: Float64Array, left: int, top: int, step: int, stride: int) -> Float64Array:
+def place_in_whole(transforms: Float64Array, left: int, top: int, stride: int) -> Float64Array:
     """Return transforms (F, 3, 3) of reduced windows as transforms of whole images."""
-    scale, middle = step * stride, step * (stride - 1) / 2
-    to_whole = np.array([[scale, 0, left + middle], [0, scale, top + middle], [0, 0, 1]], np.float64)
+    middle = (stride - 1) / 2
+    to_whole = np.array([[stride, 0, left + middle], [0, stride, top + middle], [0, 0, 1]], np.float64)
     moved = to_whole @ transforms @ np.linalg.inv(to_whole)
     return np.asarray(moved / moved[:, 2:, 2:])
 
@@ -267,7 +277,7 @@ def _solve(
 
 
 class _Features(NamedTuple):
-    """What a level compares, each (F, P): high-pass filtered images, their gradients, brightness, and known pixels."""
+    """Features of a level, each (F, P): high-pass filtered images, their gradients, brightness, and known pixels."""
 
     values: Float32Array
     right: Float32Array
@@ -279,6 +289,7 @@ class _Features(NamedTuple):
 class _Fit(NamedTuple):
     """The matte model of a state: weights (F, P), a root of b's covariance (3, 3, P), b (3, P), residuals (F, P)."""
 
+    lit: Floats  # the weights before the robust fit
     weights: Floats
     root: Float64Array
     surface: Float64Array
@@ -340,11 +351,12 @@ class _Level:
                 return
 
     def correlations(self) -> Float64Array:
-        """Return the correlation (F,) of each image with its prediction."""
+        """Return the correlation (F,) of each image with its prediction from the others, over the lit pixels."""
         fit = self._fit(self.data, self.lights)
-        values, weights = self.data.values.astype(np.float64), fit.weights
-        predicted = values - fit.left
-        sums = ((weights * a * b).sum(axis=1) for a, b in ((values, predicted), (values, values), (predicted,) * 2))
+        values = self.data.values.astype(np.float64)
+        leverage = fit.weights * sum((self.lights @ axis) ** 2 for axis in fit.root)
+        predicted = values - fit.left / np.maximum(1 - leverage, 1e-3)  # the residual without the image itself
+        sums = ((fit.lit * a * b).sum(axis=1) for a, b in ((values, predicted), (values, values), (predicted,) * 2))
         products, squares, others = sums
         return np.asarray(products / np.sqrt(squares * others + 1e-30))
 
@@ -395,7 +407,7 @@ class _Level:
             weights = lit / (1 + (left / scale) ** 2)
         root, surface, left = _matte(values, weights, lights)
         cost = float((lit * np.log1p((left / scale) ** 2) * scale**2).sum() / max(lit.sum(), 1e-6))
-        return _Fit(weights, root, surface, left, scale, cost)
+        return _Fit(lit, weights, root, surface, left, scale, cost)
 
     def _equations(self, fit: _Fit) -> tuple[Float64Array, Float64Array, float]:
         """Return the normal equations of all images' parameters and lights, without b, and the weight of a prior."""
@@ -466,7 +478,7 @@ _GENERATORS = np.array(
 
 
 def _medians(shares: Float64Array) -> Float64Array:
-    """Return the medians (F,) of shares (F, P) without NaN; that of all where there are none."""
+    """Return the medians (F,) of shares (F, P) without NaN; an image of NaN alone gets the median of all."""
     usual = float(np.nanmedian(shares)) if not np.isnan(shares).all() else 1.0
     return np.array([np.nanmedian(row) if not np.isnan(row).all() else usual for row in shares])
 

@@ -101,7 +101,7 @@ def white_level_warnings(level: WhiteLevel | None) -> list[CaptureWarning]:
     """Warn of a white level that no file states, seen in the images."""
     if level is None or level.origin != "images":
         return []
-    text = f"The images look clipped at {level.value:g}, so this value counts as saturated."
+    text = f"The images look clipped at {level.value:g}, so this value is treated as saturated."
     return [CaptureWarning(WHITE_LEVEL, f"{text} Use --white-level N to set another value.")]
 
 

@@ -108,7 +108,7 @@ def result_page(
         title=report["capture"],
         report=report,
         facts=_facts(report, size if is_reduced else None),
-        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all of them."
+        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all pixels."
         if is_reduced
         else None,
         unit="pixels" if millimetres is None else "mm",

@@ -182,7 +182,7 @@ def _normals_of(blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edge
 def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
     """Return the heights (P,) of a prior in the unit of the equations, NaN where it is not known."""
     if prior.shape != mask.shape:
-        raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape}, that of the normal map")
+        raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape} as in the normal map")
     heights = prior[mask].astype(np.float64)
     _refuse(np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE), mask, f"beyond {_LARGEST_VALUE:g}")
     if camera_matrix is not None:
@@ -221,7 +221,7 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        problem = f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1"
+        problem = f"the prior is {steeper:.2g} times as steep as the normals, expected about 1"
         hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the result"
         raise InputError(problem, hint=hint)
     assert surface.prior is not None

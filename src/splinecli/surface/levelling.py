@@ -21,19 +21,19 @@ def plane_slopes(
     """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y is up.
 
     Args:
-        points: columns and rows of at least three points on the plane, or () for the plane that most pixels are near
+        points: columns and rows of at least three points on the plane, or () for the dominant plane of the surface
             (iteratively reweighted least squares with Cauchy's weights).
         aspect: height of a pixel in widths, the unit of the heights.
 
     Raises:
-        UsageError: a point is not on the object, or the points lie in a line.
+        UsageError: a point is not on the object, or the points are on one line.
     """
     if points:
         values = []
         for x, y in points:
             around = heights[max(0, y - _AROUND) : y + _AROUND + 1, max(0, x - _AROUND) : x + _AROUND + 1]
             if not (0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]) or not np.isfinite(heights[y, x]):
-                raise UsageError(f"--level has the point {x},{y}, which is not on the object")
+                raise UsageError(f"the point {x},{y} of --level is not on the object")
             values.append(float(np.nanmedian(around)))
         columns, rows = np.array(points, np.float64).T
         z = np.array(values)
@@ -43,7 +43,7 @@ def plane_slopes(
     terms = np.stack((columns - columns.mean(), (rows.mean() - rows) * aspect, np.ones(len(z))), axis=1)
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] < 1e-2 * sizes[0]:
-        raise UsageError("--level: the points lie in a line", hint="Choose points that are spread in x and y")
+        raise UsageError("the points of --level are in a line", hint="Choose points that span a plane")
     weights, right, up = np.ones(len(z)), 0.0, 0.0
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]

@@ -17,7 +17,7 @@ class Advance(Protocol):
 
 
 class Clock:
-    """Adds up the seconds of stages, and moves one progress bar, from 0 to 1, through all of them.
+    """Adds up the seconds of stages, and moves one progress bar, from 0 to 1, through all stages.
 
     A stage ends where the next one begins. The first is reading.
     """

@@ -54,7 +54,7 @@ class TrainingConfig:
     weight_decay: NotNegative = 1e-3
     gradient_limit: NotNegative = 1.0  # largest norm of the gradient; 0 for none
     average_decay: BelowOne = 0.9995  # decay of the running average of the weights, which is saved; 0 for none
-    # canonical networks see each pixel turned by up to this angle, either way, and half of the batches mirrored.
+    # canonical networks train on pixels rotated by up to this angle, either way; half of the batches are mirrored.
     # Estimates from several views can then be averaged.
     turn_jitter_deg: NotNegative = 15.0
     # angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.

@@ -140,7 +140,7 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
     with damage_as_input_error(film, problem, hint), film.open("rb") as file:
         start = file.read(16)
         if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files are read as films")
         file.seek(0)
         # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
