@@ -51,7 +51,8 @@ FILES = {
     "OUT/frames/NAME": "The frames of a film, a capture of its own.",
     "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json and, with --level, level_normals.npy and"
-    " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and mesh_metalness.png) and mesh.stl.",
+    " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and mesh_metalness.png)"
+    " and mesh.stl.",
     "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that follows the pointer.",
     "OUT/NAME/report.json": "Lights, method, weights, options, time, warnings and errors.",
     "OUT/index.html": "With several captures: links to all results.",
