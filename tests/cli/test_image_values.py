@@ -40,7 +40,7 @@ def test_an_inverted_mask(run, background):
     found = codes(run, wrong)
     assert "mask_inverted" in found and "dark_images" not in found
     result = run("infer", wrong, "--method", "ls", "--strict")
-    assert result.code == 3 and "mask.png leaves out a bright area in the middle" in result.err
+    assert result.code == 3 and "mask.png excludes a bright area in the middle" in result.err
 
 
 def test_a_mask_around_a_dark_hole_is_right(run):
