@@ -22,8 +22,7 @@ from splinecli.pixel_sets.store import open_pixel_set
 from splinecli.restoration import lens_blur
 from splinecli.synthesis import draw_number, stream_seed
 from splinecli.synthesis.batches import add_sensor_noise
-from splinecli.synthesis.optics import draw_optics
-from splinecli.synthesis.whole_capture import add_background
+from splinecli.synthesis.whole_capture import add_background, draw_optics
 from splinecli.training import refinement
 from splinecli.training.config import PRESETS
 
