@@ -29,8 +29,7 @@ from splinecli.maths.transfer import encode_srgb
 from splinecli.restoration.lamps import estimate_light_intensities
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.rendering import render_direct, render_indirect
-from splinecli.synthesis.scenes import SceneConfig, draw_scene
+from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_direct, render_indirect
 
 Array = NDArray[np.float64]
 WIDTHS = (2.0, 3.0, 4.0, 6.0)

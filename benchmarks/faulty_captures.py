@@ -30,8 +30,7 @@ from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.rendering import render_direct, render_indirect
-from splinecli.synthesis.scenes import draw_patches
+from splinecli.synthesis.scenes import draw_patches, render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn
 from splinecli.synthesis.whole_capture import photograph_scene
 

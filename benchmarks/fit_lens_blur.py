@@ -3,7 +3,7 @@
     python benchmarks/fit_lens_blur.py SET ... [--captures 1600] [--seed 41]
 
 SET are pixel sets of scenes with neighbours, such as `splinecli prepare --random 80` makes. Each capture is
-photographed through an optics of its own (synthesis/optics.py), with noise and in a third of the captures with 8 bits.
+photographed through its own optics (synthesis/whole_capture.py), with noise and, in a third of the captures, 8 bits.
 The wanted number is the sigma whose inverse filter brings the images closest to those without a lens; a Bayer pattern
 has one, too.
 """
@@ -22,8 +22,7 @@ from splinecli.pixel_sets.store import open_pixel_set
 from splinecli.restoration import lens_blur
 from splinecli.synthesis import draw_number, stream_seed
 from splinecli.synthesis.batches import add_sensor_noise
-from splinecli.synthesis.optics import draw_optics
-from splinecli.synthesis.whole_capture import add_background
+from splinecli.synthesis.whole_capture import add_background, draw_optics
 from splinecli.training import refinement
 from splinecli.training.config import PRESETS
 

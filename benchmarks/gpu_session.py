@@ -186,6 +186,7 @@ def finish_set(folder: str) -> Row:
 
 def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: float) -> Row:
     """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of it at most."""
+    from splinecli.cli.console import Messages
     from splinecli.training import tasks
     from splinecli.training.config import configure
     from splinecli.training.loop import open_run
@@ -197,7 +198,9 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
     share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
     tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (max(1, round(share * number)) for number in (usual, held))
     config = configure("refine", None, [{"sources": {pixel_set: 1.0}, "minutes": minutes_left()}])
-    with open_run(config, Path(run), device, resume=False, tensorboard=False, warn=print, say=print) as trainer:
+    with open_run(
+        config, Path(run), device, resume=False, tensorboard=False, observer=Messages(quiet=False)
+    ) as trainer:
         # How long photographing takes is known only now.
         trainer.config = dataclasses.replace(config, minutes=minutes_left())
         last = trainer.run()

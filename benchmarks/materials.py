@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.evaluation.relighting import lambertian, likeness
+from splinecli.evaluation.figures import lambertian, likeness
 from splinecli.inference import estimate_normals, lighting_on
 from splinecli.materials.lobes import Geometry
 from splinecli.materials.maps import estimate_material, lights_that_reach, render_gray

@@ -25,7 +25,7 @@ from splinecli.surface.integration import integrate_normals
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import Tracer, VisibleSurface, find_visible_surface
-from splinecli.synthesis.rendering import render_direct
+from splinecli.synthesis.scenes import render_direct
 
 # Angles of the ten lamps from the viewing direction and azimuths in degrees, as placed by hand.
 LAMPS_DEG = (

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer, VisibleSurface
-from splinecli.synthesis.rendering import Materials
+from splinecli.synthesis.scenes import Materials
 
 
 def render_point_lights(

@@ -1,7 +1,7 @@
 """Draw pixels for the material net and train it: how assets/material-net.safetensors was made.
 
     python benchmarks/train_material_net.py draw FOLDER
-    python benchmarks/train_material_net.py train FOLDER [--steps 8000] [--ship]
+    python benchmarks/train_material_net.py train FOLDER [--steps 16000] [--ship]
 
 Both go on after an interruption. The pixels are those of the training of spline-net: their materials and faults are
 described in synthesis/. The network's tokens for them are stored, because it is not changed. A shard of 512 captures
@@ -182,7 +182,7 @@ if __name__ == "__main__":
     parser.add_argument("step", choices=("draw", "train"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--shards", type=int, default=48)
-    parser.add_argument("--steps", type=int, default=8_000)
+    parser.add_argument("--steps", type=int, default=16_000)
     parser.add_argument("--ship", action="store_true", help="write into the package")
     given = parser.parse_args()
     if given.step == "draw":

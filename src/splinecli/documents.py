@@ -208,19 +208,22 @@ class MethodResult(Document):
 
 
 class ComparisonReport(Document):
-    """Two methods compared on a capture, in degrees."""
+    """Two methods compared trial by trial, on a capture or on the average over the captures, in degrees."""
 
+    # With one trial, or if the differences of all trials are equal but not zero, no test is possible, and the last four
+    # are None. If all differences are zero, the interval is (0, 0) and p is 1.
     first: str
     second: str
     capture: str
     n_lights: DrawnLights
     light_noise_deg: NotNegative
     trials: int
-    difference_deg: float
-    std_deg: NotNegative
+    difference_deg: float  # mean over the trials of the errors of `first` minus those of `second`
+    std_deg: NotNegative  # population standard deviation of the differences
+    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
     interval_deg: tuple[float, float] | None
     p_value: float | None
-    p_holm: float | None
+    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
     differs: bool | None
 
 

@@ -36,7 +36,7 @@ from splinecli.methods.estimator import TILE_PIXELS, confidence
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.pixel_grid import Blocks, rays_at
 from splinecli.system.machine import return_freed_memory
-from splinecli.system.progress import Clock, Progress
+from splinecli.system.progress import Clock, Progress, ignore
 
 PIXELS_ON_THE_WAY = 40_000  # larger captures are fitted at about this size: fine detail hardly moves the surface
 
@@ -99,7 +99,7 @@ def estimate_normals(
     capture: Capture,
     estimator: Estimator,
     *,
-    progress: Progress | None = None,
+    progress: Progress = ignore,
     clock: Clock | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
@@ -137,7 +137,7 @@ def estimate_normals(
 
 
 def _estimate(
-    capture: Capture, estimator: Estimator, progress: Progress | None, clock: Clock
+    capture: Capture, estimator: Estimator, progress: Progress, clock: Clock
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
 
@@ -176,7 +176,7 @@ def estimate_pixels(
     observations: NDArray[np.float32],
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
-    progress: Progress | None = None,
+    progress: Progress = ignore,
     clock: Clock | None = None,
 ) -> PixelEstimates:
     """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
@@ -193,7 +193,7 @@ def estimate_pixels(
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
-    def estimate(pixels: PixelIndices, light: PixelLighting, progress: Progress | None = None) -> None:
+    def estimate(pixels: PixelIndices, light: PixelLighting, progress: Progress = ignore) -> None:
         found, of_pixels = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
         if errors is not None:
             errors[pixels] = of_pixels

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from splinecli.capture import read_light_directions, read_light_intensities
-from splinecli.capture.light_files import NamedLights, read_lights
+from splinecli.capture.light_files import match_images, read_lights
 from splinecli.errors import InputError
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
@@ -172,12 +172,11 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
 @pytest.mark.parametrize("stem", ["img", "2024_0"])
 def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> None:
     """A name such as 2024_01, which Python would read as a number, is a name."""
-    lights = read_lights(write(tmp_path, text.replace("img", stem)), 4)
-    assert isinstance(lights, NamedLights)
+    table, directions = read_lights(write(tmp_path, text.replace("img", stem)), 4)
     wanted = [Path(f"{stem}{number}.png") for number in (1, 2, 3, 10)]
-    images, how = lights.match(wanted)
+    images, how = match_images(table, wanted)
     assert how.startswith("name")
-    found = dict(zip(images, lights.directions, strict=True))
+    found = dict(zip(images, directions, strict=True))
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 

@@ -1,7 +1,13 @@
-"""Whole captures: observations against the photographs written, and real ones against known errors."""
+"""Whole captures: observations against the photographs written, and real ones against known errors; what the record
+refuses; reading ahead.
+"""
 
+import subprocess
+import sys
+import threading
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +16,10 @@ from numpy.typing import NDArray
 
 from capture.conftest import WriteImage
 from scenes import ring_lights, write_capture
-from splinecli.capture import CaptureWarning, open_capture, read_capture
-from splinecli.errors import InputError
+from splinecli.capture import Capture, CaptureWarning, open_capture, read_capture
+from splinecli.capture import source as module
+from splinecli.capture.source import read_ahead
+from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -128,3 +136,99 @@ def test_positions_given_as_directions_are_named(tmp_path: Path, scale: float, s
     assert len(found) == warned
     if warned:
         assert "lengths from 200 to 260" in found[0] and "--light-positions" in found[0]
+
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+MASK = np.array([[True, False, True], [True, True, False]])
+
+
+def make(**changes: Any) -> Capture:
+    fields: dict[str, Any] = {"name": "vase", "observations": np.arange(16).reshape(4, 4), "mask": MASK}
+    return Capture(**(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes))
+
+
+def test_positions_that_cannot_be_meant() -> None:
+    for positions, message in (
+        ([0, 1, -1], "light index -1 is out of range"),
+        ([0, 1, 2, 1], "light index 1 is listed twice. Name each light once."),
+        ([0, 1], "2 lights chosen, expected at least 3."),
+    ):
+        with pytest.raises(UsageError, match=message):
+            make().choose_lights(positions)
+
+
+NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": np.zeros((5, 4))}, r"observations of shape \(5, 4\), expected .* = \(4, 4\)"),
+        ({"observations": np.full((4, 4), np.nan)}, "an observation is not finite"),
+        ({"light_directions": LIGHTS[:, :2]}, r"light directions of shape \(4, 2\), expected \(F, 3\)"),
+        ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
+        ({"light_directions": LIGHTS * 1.01}, "a light direction is not a unit vector"),
+        ({"light_directions": LIGHTS * np.nan}, "a light direction is not finite"),
+        ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 is below the horizon \(z <= 0\)"),
+        ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
+        ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
+        ({"ground_truth": np.zeros((3, 2, 3))}, r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)"),
+        ({"ground_truth": np.full((2, 3, 3), 0.1)}, NO_NORMAL),
+        ({"ground_truth": np.full((2, 3, 3), np.nan)}, NO_NORMAL),
+    ],
+)
+def test_fields_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"vase: {message}"):
+        make(**changes)
+
+
+def test_restored_observations_follow_the_choice() -> None:
+    restored = np.arange(16).reshape(4, 4) % 3 == 0
+    capture = make(restored=restored)
+    np.testing.assert_array_equal(capture.choose_lights([3, 0, 2]).restored, restored[:, [3, 0, 2]])
+    chosen = capture.choose_pixels(np.array([0, 3]))
+    np.testing.assert_array_equal(chosen.restored, restored[[0, 3]])
+    np.testing.assert_array_equal(chosen.observations, capture.observations[[0, 3]])
+    np.testing.assert_array_equal(chosen.mask, [[True, False, False], [False, True, False]])
+    assert make().choose_lights([0, 1, 2]).restored is None
+    with pytest.raises(InputError, match=r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"):
+        make(restored=restored[:, :3])
+
+
+@pytest.fixture(params=[True, False])
+def stderr_is_apart(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    apart: bool = request.param
+    monkeypatch.setattr(module, "stderr_is_apart", lambda: apart)
+    return apart
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_all_come_in_their_order(stderr_is_apart: bool, count: int) -> None:
+    assert list(read_ahead(lambda item: 10 * item, range(count))) == [10 * item for item in range(count)]
+
+
+def test_the_next_item_is_read_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "stderr_is_apart", lambda: True)
+    begun = [threading.Event() for _ in range(4)]
+    for item in (images := read_ahead(lambda item: begun[item].set() or item, range(4))):
+        assert begun[min(item + 1, 3)].wait(10)
+        assert not any(event.is_set() for event in begun[item + 2 :])
+    assert next(images, None) is None
+
+
+def test_messages_of_the_command_are_not_caught_with_those_of_the_libraries() -> None:
+    script = """
+import os, sys
+from contextlib import redirect_stderr
+from splinecli.capture.formats.decoders import native_stderr, stderr_is_apart
+from splinecli.cli.main import _apart
+assert not stderr_is_apart()
+with redirect_stderr(_apart(sys.stderr)):
+    assert stderr_is_apart()
+    with native_stderr() as messages:
+        print("12 %", file=sys.stderr)
+        os.write(2, b"libpng warning")
+assert messages == ["libpng warning"], messages
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert ran.stderr == "12 %\n"

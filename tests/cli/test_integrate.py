@@ -137,7 +137,7 @@ BAD_PRIORS = {
     "one of 1e60": (with_one(1e60), "values of the prior are beyond 1e+07, the first in row 9, column 20."),
     "one of 1e6": (with_one(1e6), "than 3 times the width of the object, the first in row 9, column 20."),
     "one among few": (with_one(1e6, 97), "than 3 times the width of the object, the first in row 9, column 20."),
-    "negated": (-sphere()[1].astype(np.float32), "the slopes of the prior are -"),
+    "negated": (-sphere()[1].astype(np.float32), "the prior is -"),
 }
 
 

@@ -117,10 +117,9 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
 
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
-    from splinecli.training import distributed
     from splinecli.training import loop as training_run
 
-    monkeypatch.setattr(training_run, "join_workers", lambda device: (distributed.Workers(0, 3), device))
+    monkeypatch.setattr(training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device))
     result = run("train", "-o", "run", "--steps", 1)
     assert (result.code, result.out) == (2, "")
     assert "3 processes cannot share the 4 shards" in result.err

@@ -11,8 +11,9 @@ import pytest
 
 from html_page import HtmlPage
 from splinecli import __version__
+from splinecli.documents import SkippedCapture
 from splinecli.evaluation.document import html_report
-from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()
@@ -29,7 +30,7 @@ def evaluation_of(methods: list[str], captures: list[str], *, trials: int = 4, n
         for capture, (m, method) in product(captures, enumerate(methods))
     )
     protocol = Protocol(n_lights, trials, seed=7, max_pixels=500)
-    return Evaluation(protocol, results, (Skipped("bear", "bear: no images."),))
+    return Evaluation(protocol, results, (SkippedCapture(capture="bear", reason="bear: no images."),))
 
 
 def test_one_evaluation() -> None:
@@ -91,7 +92,9 @@ def test_it_stands_alone() -> None:
 
 @pytest.mark.parametrize("name", ["<b>&", '"><script>alert(1)</script>', "{{ 7 * 7 }}", "a'b"])
 def test_names_are_text(name: str) -> None:
-    evaluation = replace(evaluation_of([name, "ls"], [name + "1", "ball"]), skipped=(Skipped(name, name),))
+    evaluation = replace(
+        evaluation_of([name, "ls"], [name + "1", "ball"]), skipped=(SkippedCapture(capture=name, reason=name),)
+    )
     page = HtmlPage(html_report([evaluation], [(name, PNG)], [name]))
     assert all(name in page.text[tag] for tag in ("th", "strong", "figcaption"))
     assert all_of(page, "img")[0]["alt"] == name

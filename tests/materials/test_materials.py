@@ -14,7 +14,7 @@ from scenes import cap_directions, sphere, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
-from splinecli.evaluation.relighting import likeness
+from splinecli.evaluation.figures import likeness
 from splinecli.inference import estimate_normals
 from splinecli.lights.lighting import PixelLighting
 from splinecli.materials import maps

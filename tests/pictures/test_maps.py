@@ -1,10 +1,19 @@
-"""Known values and errors have known colours; maps of every size are legible; PNG files keep every value."""
+"""Maps, plots and observation maps: known values have known colours at known places, in every size of picture.
+
+PNG files keep every value; curves leave out what was not computed, and anything may be a title.
+"""
+
+from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from scenes import decode_rgb
 from splinecli.errors import OutputError
+from splinecli.maths.normals import unit
 from splinecli.pictures.maps import (
     PREVIEW_LIGHT,
     TOP_DEG,
@@ -13,7 +22,7 @@ from splinecli.pictures.maps import (
     encode_png,
     preview_picture,
 )
-from splinecli.pictures.plots import error_map_picture
+from splinecli.pictures.plots import error_map_picture, method_maps, observation_map_figure, sky_plot, training_figure
 
 
 def test_white_is_the_brightest_hundredth_of_the_mask():
@@ -89,3 +98,169 @@ def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
     assert (right < 64).all(axis=2).sum() > 200
     assert (picture[[0, -1]] == 255).all()
     assert (picture[:, -1] == 255).all()
+
+
+COLUMNS: dict[str, list[float | None]] = {
+    "step": [50, 100, 125], "loss": [2.0, 1.0, 0.5], "symmetric": [None, 0.5, None], "asymmetric": [None] * 3,
+    "angle_deg": [20.0, 10.0, 8.0], "validation_deg": [None, 12.5, 9.0],
+    "map_error": [0.2, 0.1, 0.08], "masked_map_error": [0.1, 0.05, 0.04],
+}  # fmt: skip
+
+
+def lines(axes: Any) -> dict[str, list[list[float]]]:
+    return {line.get_label(): [list(map(float, values)) for values in line.get_data()] for line in axes.lines}
+
+
+def test_each_curve_leaves_out_what_was_not_computed() -> None:
+    loss, angle, maps = training_figure(COLUMNS).axes
+    steps = [50, 100, 125]
+    assert lines(loss) == {"weighted sum": [steps, [2.0, 1.0, 0.5]], "Ls, unweighted": [[100], [0.5]]}
+    assert lines(angle) == {"training": [steps, [20, 10, 8]], "validation": [[100, 125], [12.5, 9]]}
+    assert lines(maps) == {"all cells": [steps, [0.2, 0.1, 0.08]], "cells with a light": [steps, [0.1, 0.05, 0.04]]}
+    assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
+    assert loss.get_title() == "loss"
+    assert loss.get_yscale() == "linear"
+
+
+def test_scales_and_hidden_axes() -> None:
+    """Wide curves are logarithmic unless a value is zero; without a LI-Net, the map errors are hidden."""
+    for middle, scale in ((1.0, "log"), (0.0, "linear")):
+        assert training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
+    columns = COLUMNS | {"map_error": [None] * 3, "masked_map_error": [None] * 3}
+    assert [axes.get_visible() for axes in training_figure(columns).axes] == [True, True, False]
+
+
+LIGHTS = np.array([(0, 0, 1), (0.6, 0, 0.8)])
+
+
+@pytest.mark.parametrize("name", ["b\udcff", "a\nb\x1b[2J", r"$\frac$"])
+def test_a_name_that_is_not_printable_or_a_formula(name: str) -> None:
+    assert sky_plot(LIGHTS, name) != sky_plot(LIGHTS, "")
+
+
+def draw(
+    height: int, width: int, methods: list[str], error_deg: float = 12.0, title: str = "title"
+) -> NDArray[np.uint8]:
+    """A mask that leaves a margin of two pixels free, ground truth (0, 0, 1), estimates along (1, 0, 1)."""
+    mask = np.zeros((height, width), bool)
+    mask[2:-2, 2:-2] = True
+    truth = np.zeros((height, width, 3), np.float32)
+    truth[mask] = (0, 0, 1)
+    estimate = np.full_like(truth, np.nan)
+    estimate[mask] = unit(np.array([1.0, 0.0, 1.0]))
+    errors = np.where(mask, np.float32(error_deg), np.float32(np.nan))
+    estimates, error_maps = dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors)
+    return decode_rgb(method_maps(truth, mask, estimates, error_maps, title=title))
+
+
+def places_of(colour: tuple[int, ...], picture: NDArray[np.uint8]) -> list[tuple[int, int, int, int]]:
+    """Boxes (top, left, height, width) of the large connected areas of a colour, from the left."""
+    _, _, boxes, _ = cv2.connectedComponentsWithStats((picture == colour).all(axis=2).astype(np.uint8))
+    return sorted((int(y), int(x), int(h), int(w)) for x, y, w, h, area in boxes[1:] if area > 500)
+
+
+BLUE = (128, 128, 255)  # of (0, 0, 1)
+TILTED = (218, 128, 218)  # of (1, 0, 1) / sqrt 2
+
+
+def error_colour(error_deg: float) -> tuple[int, ...]:
+    return tuple(int(value) for value in colour_errors(np.array([[error_deg]]))[0, 0])
+
+
+@pytest.mark.parametrize("n_methods", [1, 2, 9])
+@pytest.mark.parametrize(("height", "width"), [(10, 10), (300, 200), (40, 120), (120, 40)])
+def test_colours_stand_where_they_belong(height: int, width: int, n_methods: int) -> None:
+    picture = draw(height, width, [f"method {i}" for i in range(n_methods)])
+    [truth] = places_of(BLUE, picture)
+    normals, errors = places_of(TILTED, picture), places_of(error_colour(12), picture)
+    assert len(normals) == len(errors) == n_methods
+    # Cut to the mask's box and enlarged by a whole factor, all alike.
+    factor = truth[2] // (height - 4)
+    assert {place[2:] for place in (truth, *normals, *errors)} == {(factor * (height - 4), factor * (width - 4))}
+    # One row of normals, ground truth first; each method's errors below its normals.
+    assert {place[0] for place in normals} == {truth[0]}
+    assert truth[1] < normals[0][1]
+    assert [place[1] for place in errors] == [place[1] for place in normals]
+    assert errors[0][0] >= truth[0] + truth[2]
+
+
+def test_the_frame_is_not_turned() -> None:
+    mask = np.ones((100, 100), bool)
+    truth = np.zeros((100, 100, 3))
+    truth[:50], truth[50:] = (0, 0, 1), unit(np.array([1.0, 0.0, 1.0]))
+    errors = np.zeros((100, 100))
+    errors[:, 50:] = 30
+    picture = decode_rgb(method_maps(truth, mask, {"a": truth}, {"a": errors}, title="t"))
+    assert [p[0] for p in places_of(BLUE, picture)] < [p[0] for p in places_of(TILTED, picture)]
+    right = [place for place in places_of(error_colour(30), picture) if place[2] > 90]
+    left = [place for place in places_of(error_colour(0), picture) if place[2] > 90]
+    assert left[0][1] + left[0][3] == right[0][1]
+
+
+def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale() -> None:
+    picture = draw(300, 300, ["ls"])
+    for error_deg in (0.0, TOP_DEG / 2, TOP_DEG):
+        assert (picture == error_colour(error_deg)).all(axis=2).sum() >= 10
+    long = "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 degrees $x$"
+    for methods in (["ls"], ["a method with a long name", "b"]):
+        picture = draw(20, 30, methods, title=long)
+        for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+            assert (edge == 255).all()
+
+
+SIZE = 8
+CELL_YELLOW, CELL_VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255
+
+
+@cache
+def draw_cells(
+    n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
+) -> NDArray[np.uint8]:
+    """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is empty."""
+    sparse = np.full((n_pixels, SIZE, SIZE), np.nan, np.float32)
+    sparse[:, 1, 5] = 1
+    png = observation_map_figure(
+        sparse,
+        np.zeros_like(sparse) if with_dense else None,
+        np.full_like(sparse, np.nan) if with_truth else None,
+        pixels=np.array([[12, 34]] * n_pixels) if named else None,
+        error_deg=np.full(n_pixels, 3.25),
+        title="$cat$, 10 lights" if named else "",
+        grid=grid,  # type: ignore[arg-type]
+    )
+    return decode_rgb(png)
+
+
+def boxes(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> list[NDArray[np.int32]]:
+    """Left, top, width, height of the areas of a colour that are as large as a cell, downwards."""
+    same = (np.abs(picture.astype(int) - colour).max(axis=2) <= 2).astype(np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(same)
+    return sorted((box[:4] for box in stats[1:] if box[4] > 400), key=lambda box: (box[1], box[0]))
+
+
+@pytest.mark.parametrize("n_pixels", [1, 4])
+def test_cells_stand_where_they_are(n_pixels: int) -> None:
+    picture = draw_cells(n_pixels)
+    # Frames around a map, from its empty corner beside the circle.
+    dense = [box for box in boxes(picture, CELL_VIOLET) if min(box[2:]) > 100]
+    assert len(dense) == n_pixels
+    for cell, whole in zip(boxes(picture, CELL_YELLOW), dense, strict=True):
+        side = whole[2] / SIZE
+        assert cell[2:] == pytest.approx([side, side], abs=2)
+        assert cell[1] - whole[1] == pytest.approx(side, abs=3)  # row 1
+        assert cell[0] < whole[0]  # the sparse map is left of the dense one
+
+
+def test_empty_cells_are_gray_and_the_truth_may_be_missing() -> None:
+    with_truth, without = draw_cells(2), draw_cells(2, with_truth=False)
+    assert with_truth.shape[1] > without.shape[1]
+    gray = [(np.abs(p.astype(int) - GRAY).max(axis=2) <= 1).sum() for p in (with_truth, without)]
+    assert gray[0] > 1.8 * gray[1]
+
+
+def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map() -> None:
+    whole, unnamed, without = draw_cells(2), draw_cells(2, named=False), draw_cells(2, named=False, with_dense=False)
+    assert len(boxes(unnamed, CELL_YELLOW)) == len(boxes(without, CELL_YELLOW)) == 2
+    assert boxes(unnamed, CELL_YELLOW)[0][1] < boxes(whole, CELL_YELLOW)[0][1]  # no title above
+    assert without.shape[1] < unnamed.shape[1]
+    assert not [box for box in boxes(without, CELL_VIOLET) if box[2] > 100]

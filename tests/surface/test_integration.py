@@ -266,7 +266,7 @@ def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> 
 def test_a_prior_in_another_direction_or_unit() -> None:
     normals, heights, _ = drifting()
     for factor in (-1.0, 20.0, 0.01):
-        with pytest.raises(InputError, match="the slopes of the prior are") as raised:
+        with pytest.raises(InputError, match="the prior is") as raised:
             integrate_normals(normals, prior=factor * heights)
         stated = re.search(r"are (\S+) times", str(raised.value))
         assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)

@@ -1,11 +1,18 @@
-"""Meshes of height maps."""
+"""Meshes of height maps, from blocks of pixels or decimated: relit as viewers do, they have the measured normals."""
+
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from glb_file import read_glb
 from splinecli.errors import UsageError
-from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.surface import mesh as mesh_module
+from splinecli.surface.mesh import SurfaceMesh, decimated_mesh, surface_mesh
+from splinecli.surface.pixel_grid import Blocks
+from splinecli.surface.surface_files import Surface, encode_surface
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
 
@@ -97,3 +104,137 @@ def test_normals_of_the_triangles() -> None:
     mesh = surface_mesh(0.5 * COLUMNS - 2.0 * ROWS, np.ones((15, 20), bool))
     slope = np.array((-0.5, -2, 1))
     np.testing.assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6)
+
+
+RNG = np.random.default_rng(0)
+MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
+
+
+@pytest.mark.parametrize("share", [1.0, 0.01])
+def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share: float) -> None:
+    mask = RNG.random((300, 400)) < share
+    blocks = Blocks.over(mask, 100)
+    assert 50 <= np.count_nonzero(blocks.mask) <= 200
+
+
+@pytest.mark.parametrize("step", [1, 3, 7])
+def test_samples_are_those_of_scipy(step: int) -> None:
+    blocks = Blocks.of_step(MASK, step)
+    values = RNG.random((np.count_nonzero(blocks.mask), 2)).astype(np.float32)
+    found = blocks.sample(blocks.spread(values), *np.nonzero(MASK))
+    for column, of_blocks in zip(found.T, values.T, strict=True):
+        depth = np.full(blocks.mask.shape, np.nan)
+        depth[blocks.mask] = of_blocks
+        np.testing.assert_allclose(column, blocks.interpolate(depth, MASK), atol=1e-6)
+
+
+SIDE = 90
+CAMERA_OF_SPHERE = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
+
+Floats = NDArray[np.float64]
+
+
+def measured(columns: Floats, rows: Floats) -> Floats:
+    """Return the normals (..., 3) of a dome with relief that is finer than the triangles will be."""
+    across, up = (columns - 44.5) / 60, (44.5 - rows) / 60
+    x = across + 0.35 * np.sin(columns / 2.5) * np.cos(rows / 4)
+    y = up + 0.35 * np.cos(columns / 3) * np.sin(rows / 2)
+    return unit(np.stack((x, y, np.ones_like(x)), axis=-1))
+
+
+def height_of_dome(columns: Floats, rows: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
+
+
+def dome(camera: NDArray[np.float64] | None, odd: int = 0) -> tuple[tuple[Any, ...], NDArray[np.float64]]:
+    """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the relief."""
+    rows, columns = np.mgrid[: SIDE + odd, :SIDE].astype(float)
+    mask = np.hypot(columns - 44.5, rows - 44.5) < 42
+    height = height_of_dome(columns, rows)
+    normal_map = measured(columns, rows) * mask[..., None]
+    depth = height if camera is None else 3 - height / 125
+    return (depth, mask, camera, np.full((*mask.shape, 3), 90, np.uint8)), normal_map
+
+
+@pytest.fixture(scope="module", params=[None, CAMERA_OF_SPHERE], ids=["orthographic", "perspective"])
+def camera(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
+    surface, normal_map = dome(camera)
+    return decimated_mesh(*surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map)
+
+
+def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
+    full = surface_mesh(*dome(None)[0])
+    assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
+    ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
+    _, arrays = read_glb(content)
+    assert (arrays["TANGENT"][:, 3] == 1).all()
+    # Ten points in each triangle.
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))
+    uv, smooth, tangent = (
+        np.einsum("ktc,tcx->ktx", weights, arrays[name][arrays["indices"]]).reshape(-1, arrays[name].shape[1])
+        for name in ("TEXCOORD_0", "NORMAL", "TANGENT")
+    )
+    columns, rows = (uv * SIDE - 0.5).T
+    inside = np.hypot(columns - 44.5, rows - 44.5) < 41
+    # The nearest texel, read at its own place. A viewer interpolates between texels.
+    columns, rows = np.rint(columns), np.rint(rows)
+    texels = arrays["normal"][rows.astype(int), columns.astype(int)] / 255 * 2 - 1
+    smooth, side = unit(smooth), unit(tangent[:, :3])
+    lit = unit(np.einsum("px,pxy->py", texels, np.stack((side, np.cross(smooth, side), smooth), axis=1)))
+    errors, without = (angle_between_deg(found, measured(columns, rows))[inside] for found in (lit, smooth))
+    # 8 bits are accurate to 0.3 degrees; half a texel is up to 4 degrees on the dome, and less on average.
+    assert errors.mean() < 1.0
+    assert without.mean() > 10
+
+
+def test_tangents_are_those_that_viewers_compute(decimated: SurfaceMesh, camera: NDArray[np.float64] | None) -> None:
+    """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a vertex."""
+    corners = decimated.vertices[decimated.triangles].astype(float)
+    uvs = decimated.uvs[decimated.triangles].astype(float)
+    edges, steps = corners[:, 1:] - corners[:, :1], uvs[:, 1:] - uvs[:, :1]
+    along_u, along_v = np.moveaxis(np.linalg.solve(steps, edges), 1, 0)
+    total = np.zeros_like(decimated.vertices, dtype=float)
+    np.add.at(total, decimated.triangles, unit(along_u)[:, None])
+    normals, tangents = decimated.normals.astype(float), decimated.tangents
+    expected = unit(total - (total * normals).sum(axis=1, keepdims=True) * normals)
+    counts = np.bincount(decimated.triangles.ravel())
+    error = angle_between_deg(tangents, expected)[counts >= 5]  # away from the border
+    assert error.mean() < 1.5
+    # Green points up in the image, against v.
+    bitangents = np.cross(normals, tangents)[decimated.triangles]
+    assert (np.einsum("tcx,tx->tc", bitangents, along_v) < 0).all()
+
+
+def test_vertices_stay_on_the_dome_and_in_their_places(decimated, camera):
+    columns, rows = (decimated.uvs * SIDE - 0.5).T
+    x, y = decimated.vertices[:, 0] + 44.5, 44.5 - decimated.vertices[:, 1]
+    if camera is not None:
+        x, y, _ = (decimated.vertices / -decimated.vertices[:, 2:] * (1, -1, -1) @ camera.T).T
+    np.testing.assert_allclose(np.stack((columns, rows)), np.stack((x, y)), atol=1e-3)
+    height = height_of_dome(columns, rows)
+    depth = height if camera is None else -(3 - height / 125)
+    scale = 1 if camera is None else 125
+    assert np.abs(decimated.vertices[:, 2] - depth).mean() * scale < 0.2  # pixels
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
+    """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their places."""
+    monkeypatch.setattr(mesh_module, "LARGE_MAP", 0)
+    surface, normal_map = dome(camera, odd)
+    mask = surface[1]
+    mesh = decimated_mesh(*surface, n_triangles=300, normal_map=normal_map)
+    assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)
+    columns, rows = (mesh.uvs * mask.shape[::-1] - 0.5).T
+    found = mesh.vertices[:, 2] if camera is None else 125 * (3 + mesh.vertices[:, 2])
+    near = np.hypot(columns - 44.5, rows - 44.5) < 38
+    assert np.abs(found - height_of_dome(columns, rows))[near].mean() < 0.5  # pixels
+    if camera is None:
+        middle = (SIDE - 1 + odd) / 2
+        np.testing.assert_allclose(mesh.vertices[:, 0], columns - 44.5, atol=1e-3)
+        np.testing.assert_allclose(mesh.vertices[:, 1], middle - rows, atol=1e-3)

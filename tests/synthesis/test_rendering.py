@@ -12,10 +12,10 @@ from torch import Tensor
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from point_lights import render_point_lights
-from splinecli.synthesis import rendering
+from splinecli.synthesis import scenes as rendering
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.rendering import render_direct, render_indirect
+from splinecli.synthesis.scenes import render_direct, render_indirect
 
 
 @dataclass(frozen=True)

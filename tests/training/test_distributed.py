@@ -37,7 +37,7 @@ from pathlib import Path
 import torch
 from splinecli.training import loop, tasks
 from splinecli.training.config import TrainingConfig
-from splinecli.training.distributed import join_workers, leave_workers
+from splinecli.training.loop import join_workers, leave_workers
 tasks.VALIDATION_PIXELS = 16
 workers, device = join_workers(torch.device("cpu"))
 assert workers.agree(7.0 + workers.rank, device) == 7.0

@@ -59,7 +59,6 @@ class LightFormat:
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
     found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
     rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
-    recognise: Callable[[Path], bool] = Path.exists  # decides by content between formats with one suffix
     encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = None  # from directions (F, 3); None if only read
 
 
@@ -67,9 +66,9 @@ FORMATS = (
     LightFormat("text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text),
     LightFormat("NumPy", (".npy",), readers.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy),
     LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
-    LightFormat("Relight", (".dome", ".json"), readers.read_dome, ("*.dome",), 2, readers.is_dome),
-    LightFormat("JSON list", (".json",), readers.read_json_list, ("light_directions.json",), 2, readers.is_list),
-    LightFormat("AliceVision", (".json",), readers.read_alicevision, ("*lights.json",), 1),
+    LightFormat("Relight", (".dome", ".json"), readers.read_json, ("*.dome",), 2),
+    LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
+    LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
     LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
     LightFormat("MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2),
     LightFormat("OpenCV", (".yml", ".yaml", ".xml"), readers.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
@@ -78,10 +77,8 @@ FORMATS = (
 
 
 def format_of(path: Path) -> LightFormat:
-    """Return the format of a light file. Raises InputError for a damaged file of one that is known by its content."""
-    suffix = path.suffix.lower()
-    alike = [each for each in FORMATS if suffix in each.suffixes] or [FORMATS[0]]
-    return next((each for each in alike[:-1] if each.recognise(path)), alike[-1]) if len(alike) > 1 else alike[0]
+    """Return the format of a light file; that of text for an unknown suffix."""
+    return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
 
 
 def light_names() -> str:
@@ -313,66 +310,53 @@ def rows_text(values: Float64Array) -> str:
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)
 
 
-@dataclass(frozen=True, eq=False)
-class NamedLights:
-    """F lights, each with the name of its image."""
+def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
+    """Return the image that each row names, and how it was matched: "name", "name without suffix" or "order".
 
-    path: Path
-    names: tuple[str, ...]  # names of the images, without folders
-    lines: tuple[int | None, ...]  # the line of each light in the file; None for each if the file has no lines
-    directions: Float64Array  # (F, 3) float64, unit; x right, y up, z to the camera
-    intensities: Float64Array | None = None  # (F, 3) float64, RGB, or None if the file has none
-
-    def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
-        """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
-
-        Images that no light names are left out, unless they are matched by order. Raises InputError if two lights have
-        the same name, or neither the names nor the number of images fit.
-        """
-        lines: dict[str, int | None] = {}
-        for name, line in zip(self.names, self.lines, strict=True):
-            if name.casefold() in lines:
-                raise InputError(f'a second light for the image "{name}"', path=self.path, line=line)
-            lines[name.casefold()] = line
-        for how, part in (("name", "name"), ("name without suffix", "stem")):
-            by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
-            wanted = [getattr(Path(name), part).casefold() for name in self.names]
-            if len(set(wanted)) == len(wanted) and all(name in by_key for name in wanted):
-                return tuple(by_key[name] for name in wanted), how
-        if len(images) == len(self.names):
-            return tuple(images), "order"
-        present = {image.name.casefold() for image in images}
-        missing = next((i for i, name in enumerate(self.names) if name.casefold() not in present), 0)
-        problem = f"found {len(self.names)} lights but {len(images)} images; the image"
-        hint = "Correct the names in the file, or give as many images as lights, in the same order"
-        problem = f'{problem} "{self.names[missing]}" is not among them'
-        raise InputError(problem, path=self.path, line=self.lines[missing], hint=hint)
+    Images that no row names are left out, unless they are matched by order. Raises InputError if two rows have the same
+    name, or neither the names nor the number of images fit.
+    """
+    names = table.names or ()
+    seen = set()
+    for name, row in zip(names, table.rows, strict=True):
+        if name.casefold() in seen:
+            raise InputError(f'a second light for the image "{name}"', path=table.path, line=row.line)
+        seen.add(name.casefold())
+    for how, part in (("name", "name"), ("name without suffix", "stem")):
+        by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
+        wanted = [getattr(Path(name), part).casefold() for name in names]
+        if len(set(wanted)) == len(wanted) and all(name in by_key for name in wanted):
+            return tuple(by_key[name] for name in wanted), how
+    if len(images) == len(names):
+        return tuple(images), "order"
+    present = {image.name.casefold() for image in images}
+    missing = next((i for i, name in enumerate(names) if name.casefold() not in present), 0)
+    problem = f"found {len(names)} lights but {len(images)} images; the image"
+    hint = "Correct the names in the file, or give as many images as lights, in the same order"
+    problem = f'{problem} "{names[missing]}" is not among them'
+    raise InputError(problem, path=table.path, line=table.rows[missing].line, hint=hint)
 
 
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
-) -> NamedLights | Float64Array:
-    """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
+) -> tuple[NumberRows, Float64Array]:
+    """Return the rows of any light file, which may name their images (see match_images), and their directions (F, 3).
 
     The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises InputError; see
     read_light_directions. A few lights below the horizon are left as they are.
     """
     table = format_of(path).read(path, n_images, form)
     n_rows = n_images if table.names is None else None
-    _, directions = lights_of(table, n_rows, frame, form, leave_bad=form != "positions")
-    if table.names is None:
-        return directions
-    return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions, table.intensities)
+    return table, lights_of(table, n_rows, frame, form, leave_bad=form != "positions")[1]
 
 
 def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
     """Return the encoder of the format that a file's suffix names. Raises UsageError for one that is only read."""
-    suffix = path.suffix.lower()
-    encode = next((each for each in FORMATS if suffix in each.suffixes), FORMATS[0]).encode
+    encode = format_of(path).encode
     if encode is None:
         *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))
         hint = f"Write {', '.join(most)} or {last}"
-        raise UsageError(f"{path}: light files of the type {suffix} are only read", hint=hint)
+        raise UsageError(f"{path}: light files of the type {path.suffix.lower()} are only read", hint=hint)
     return encode
 
 

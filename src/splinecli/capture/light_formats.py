@@ -7,14 +7,13 @@ images.
 """
 
 import json
-import math
 import re
-import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct, ValidationError, convert, field
 from numpy.typing import NDArray
 
 from splinecli.capture.formats import numbers
@@ -22,6 +21,7 @@ from splinecli.capture.formats.numbers import NumberRows, Row, to_number
 from splinecli.capture.light_rows import RowForm, image_name
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
+from splinecli.records import Positive
 from splinecli.system.files import parse_json
 
 
@@ -57,30 +57,51 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
 
 
-def read_alicevision(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read AliceVision's lights: objects with viewId, type (directional), direction [x, y, z], intensity [r, g, b]."""
-    document = _read_document(path)
-    lights = document.get("lights") if isinstance(document, dict) else None
-    if not isinstance(lights, list) or not lights:
+def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+    """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision writes."""
+    try:
+        document = parse_json("\n".join(numbers.read_lines(path)))
+    except json.JSONDecodeError as error:
+        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+    except ValueError as error:
+        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
+    named = isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
+    if named or path.suffix.lower() == ".dome":
+        return _read_dome(document, path, form)
+    listed = _listed(document)
+    if listed is None:
+        return _read_alicevision(document, path)
+    rows = tuple(Row(tuple(vector), line) for line, vector in enumerate(listed[1], start=1))
+    return NumberRows(path, rows, listed[0])
+
+
+class _Light(Struct):
+    """A light of AliceVision."""
+
+    direction: tuple[float, float, float]
+    type: Literal["directional"] = "directional"
+    view: str | int | None = field(default=None, name="viewId")
+    intensity: tuple[Positive, Positive, Positive] | None = None
+
+
+def _read_alicevision(document: Any, path: Path) -> NumberRows:
+    listed = document.get("lights") if isinstance(document, dict) else None
+    if not isinstance(listed, list) or not listed:
         problem = 'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
         raise InputError(problem, path=path)
     names, vectors, intensities = [], [], []
-    for number, light in enumerate(lights, start=1):
-        if not isinstance(light, dict):
-            raise InputError(f"light {number} is not an object", path=path)
-        kind = light.get("type", "directional")
-        if kind != "directional":
-            problem = f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'"
-            raise InputError(problem, path=path, hint="Calibrate for distant lights, one direction a light")
-        names.append(image_name(str(light.get("viewId", number)), []))
-        x, y, z = _three_numbers(light, "direction", number, path)
+    for number, values in enumerate(listed, start=1):
+        try:
+            light = convert(values, _Light)
+        except ValidationError as error:
+            hint = "Calibrate for distant lights, one direction a light"
+            raise InputError(f"light {number}: {error}", path=path, hint=hint) from None
+        names.append(image_name(str(number if light.view is None else light.view), []))
+        x, y, z = light.direction
         vectors.append((x, -y, -z))
-        if "intensity" in light:
-            intensities.append(_three_numbers(light, "intensity", number, path))
-            if (least := min(intensities[-1])) <= 0:
-                raise InputError(f"light {number} has the intensity {least:g}, expected above 0", path=path)
-    if intensities and len(intensities) != len(lights):
-        problem = f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none"
+        intensities += [] if light.intensity is None else [light.intensity]
+    if intensities and len(intensities) != len(listed):
+        problem = f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none"
         raise InputError(problem, path=path)
     return _unnumbered(path, vectors, names, intensities)
 
@@ -88,18 +109,11 @@ def read_alicevision(path: Path, n_images: int | None, form: RowForm) -> NumberR
 _DOME_POSITIONS = ("positions3d", "positionsSphere", "positions")
 
 
-def is_dome(path: Path) -> bool:
-    """Return whether a JSON file is a dome of Relight."""
-    document = _read_document(path)
-    return isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
-
-
-def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up) and z (camera).
 
     Positions are interpreted as lamp positions. ledAdjust, by which Relight multiplies the images, gives intensities.
     """
-    document = _read_document(path)
     if not isinstance(document, dict):
         raise InputError("found no object, expected a dome as Relight writes it", path=path)
     positions = _DOME_POSITIONS
@@ -116,22 +130,8 @@ def read_dome(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors if adjusted])
 
 
-def is_list(path: Path) -> bool:
-    """Return whether a JSON file has the form that read_json_list reads."""
-    return _listed(_read_document(path)) is not None
-
-
-def read_json_list(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read a list [[x, y, z], ...], or an object with the light of each image by its name."""
-    listed = _listed(_read_document(path))
-    if listed is None:
-        raise InputError("found no list of x y z, one for each image", path=path)
-    names, vectors = listed
-    rows = tuple(Row(tuple(vector), line) for line, vector in enumerate(vectors, start=1))
-    return NumberRows(path, rows, names)
-
-
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
+    """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's light by its name."""
     if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()) is not None:
         (document,) = document.values()
     names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
@@ -143,13 +143,12 @@ def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
     """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None for anything else."""
     listed = values if isinstance(values, list) else []
     vectors: list[Any] = [[each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed]
-    if not all(isinstance(vector, list) and len(vector) > 1 and all(map(_is_finite, vector)) for vector in vectors):
+    if not all(
+        isinstance(vector, list) and len(vector) > 1 and all(type(number) in (int, float) for number in vector)
+        for vector in vectors
+    ):
         return None
     return [[float(number) for number in vector] for vector in vectors] or None
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _unnumbered(
@@ -159,23 +158,6 @@ def _unnumbered(
     rows = tuple(Row(tuple(vector), None) for vector in vectors)
     given = np.array(intensities, np.float64) if intensities else None
     return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
-
-
-def _read_document(path: Path) -> Any:
-    """Return the value of a JSON file. Raises InputError."""
-    try:
-        return parse_json("\n".join(numbers.read_lines(path)))
-    except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
-    except ValueError as error:
-        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
-
-
-def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
-    values = light.get(key)
-    if not (isinstance(values, list) and len(values) == 3 and all(map(_is_finite, values))):
-        raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
-    return [float(value) for value in values]
 
 
 # OpenCV's FileStorage; its own reader is C++ that was made for trusted files.

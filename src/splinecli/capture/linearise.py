@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, In
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 from splinecli.restoration.images import ImageValues, Saturation, look_at, white_level_warnings
 from splinecli.restoration.lamps import COLOUR_SAMPLE, lamp_colours
+from splinecli.restoration.lens_blur import remove_blur
 
 Numbers = TypeVar("Numbers", bound=np.generic)
 
@@ -254,6 +255,16 @@ class StoredPixels:
         return colours
 
 
+class Observed(NamedTuple):
+    """What read_observations returns."""
+
+    observations: Float32Array  # (P, F)
+    saturation: Saturation
+    warnings: list[CaptureWarning]
+    colours: Float64Array | None  # (F, 3), of the lamps, which are divided out; None if they do not differ
+    blur: float | None  # the standard deviation in pixels of the blur that was removed
+
+
 def collect_observations(
     images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None, n_around: int = 0
 ) -> tuple[Float32Array, Saturation, list[CaptureWarning], Float64Array | None]:
@@ -289,3 +300,34 @@ def collect_observations(
         warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
     of_lamps, found_warnings = lamp_colours(np.stack(colours)) if len(colours) == n_images else (None, [])
     return observations, saturation, [*warnings, *codes.eight_bit(any_8_bit), *found_warnings], of_lamps
+
+
+def read_observations(
+    images: Callable[[Float64Array | None], Iterable[StoredPixels]],
+    mask: Bools,
+    around: Bools | None,
+    n_images: int,
+    white_level: float | None,
+    *,
+    divides_colours: bool = True,
+) -> Observed:
+    """Return the observations of a mask's pixels, without the blur of the lens and the colours of lamps that differ.
+
+    Args:
+        images: gives the pixels of the images, divided by the colours (F, 3) of the lamps if it is given some.
+        around: the pixels around the mask, whose observations follow those of the mask, to find the blur; None for
+            images whose blur stays.
+        white_level: see collect_observations.
+        divides_colours: whether the lamps may have different colours.
+    """
+    sizes = int(np.count_nonzero(mask)), n_images, white_level, 0 if around is None else int(np.count_nonzero(around))
+    observations, saturation, warnings, colours = collect_observations(images(None), *sizes)
+    if not divides_colours:
+        warnings, colours = [each for each in warnings if each.kind != codes.ESTIMATED_COLOURS], None
+    if colours is not None:  # only the mean of the channels was kept, so the images are read again
+        del observations
+        of_colours = [each for each in warnings if each.kind == codes.ESTIMATED_COLOURS]
+        observations, saturation, warnings, _ = collect_observations(images(colours), *sizes)
+        warnings = [*of_colours, *(each for each in warnings if each.kind != codes.ESTIMATED_COLOURS)]
+    blur = None if around is None else remove_blur(observations, mask, around)
+    return Observed(observations[: sizes[0]], saturation, warnings, colours, blur)

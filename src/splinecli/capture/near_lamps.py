@@ -223,7 +223,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
 class LampOptions:
     """The user's options for near lamps and the camera. All lengths have the same unit, such as millimetres.
 
-    Raises UsageError if a number is not above 0, or two options contradict each other.
+    Raises UsageError if two options contradict each other.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
@@ -234,10 +234,6 @@ class LampOptions:
     camera_matrix: str | None = None  # a file of the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
-        for name in ("distance", "pixel_size", "object_width"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise UsageError(f"the {name.replace('_', ' ')} is {value:g}, expected a number above 0")
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
                 raise UsageError(f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out")

@@ -15,16 +15,17 @@ from splinecli.capture import linearise, near_lamps
 from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
 from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_content, stamp_files
 from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
+from splinecli.capture.formats.numbers import NumberRows
 from splinecli.capture.layouts import find_capture_files
-from splinecli.capture.light_files import NamedLights, read_light_intensities, read_lights, unit_directions
+from splinecli.capture.light_files import match_images, read_light_intensities, read_lights, unit_directions
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeholders
 from splinecli.capture.source import CaptureSource, Progress
-from splinecli.capture_warnings import ESTIMATED_COLOURS, CaptureWarning
+from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Float64Array
 from splinecli.restoration.images import check_white_level
-from splinecli.restoration.lens_blur import remove_blur, surroundings
+from splinecli.restoration.lens_blur import surroundings
 from splinecli.system.files import StrPath
 
 EQUAL = "equal"  # given instead of a file of intensities: all lights have the same intensity
@@ -163,7 +164,6 @@ def open_capture(
         intensities_known=equal or found_intensities is not None,
         intensities_measured=found_intensities is not None,
         light_frame=light_frame,
-        light_numbers=files.kept,
         lamps=near,
         camera_matrix=camera_matrix,
         channels=channels,
@@ -208,7 +208,7 @@ def _read_lights(
     if path is None:
         return files, placeholders(len(files.images)), None, []
     warnings = []
-    images, lights = _match_count(files.images, path, frame, form)
+    images, table, directions = _match_count(files.images, path, frame, form)
     if len(images) < len(files.images):
         others = [image.name for image in files.images if image not in images]
         names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
@@ -217,16 +217,16 @@ def _read_lights(
         text += f" {'size' if len(set(map(_stated_size, files.images))) > 1 else 'form of name'}."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         files = replace(files, images=images)
-    if not isinstance(lights, NamedLights):
-        return _drop_bad_lights(files, lights, None, warnings)
-    images, how = lights.match(files.images)
+    if table.names is None:
+        return _drop_bad_lights(files, directions, None, warnings)
+    images, how = match_images(table, files.images)
     if len(images) < len(files.images):
         text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others were left out."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."
         warnings.append(CaptureWarning(codes.LIGHTS_MATCHED, text))
-    return _drop_bad_lights(replace(files, images=images), lights.directions, lights.intensities, warnings)
+    return _drop_bad_lights(replace(files, images=images), directions, table.intensities, warnings)
 
 
 def _drop_bad_lights(
@@ -248,13 +248,13 @@ def _drop_bad_lights(
 
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
-) -> tuple[tuple[Path, ...], Float64Array | NamedLights]:
-    """Return the images that a light file is for, and its lights.
+) -> tuple[tuple[Path, ...], NumberRows, Float64Array]:
+    """Return the images that a light file is for, its rows, and their directions (F, 3).
 
     These are all images, or else the images of the usual size, or the images whose names differ only in their numbers.
     """
     try:
-        return images, read_lights(path, len(images), frame, form)
+        return images, *read_lights(path, len(images), frame, form)
     except InputError as error:
         for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
             keys = [key(image) for image in images]
@@ -262,7 +262,7 @@ def _match_count(
             alike = tuple(image for image, of_image in zip(images, keys, strict=True) if of_image == usual)
             if len(alike) < len(images):
                 with suppress(InputError):
-                    return alike, read_lights(path, len(alike), frame, form)
+                    return alike, *read_lights(path, len(alike), frame, form)
         found = re.match(r"found (\d+) [a-z ]+, expected \d+, one for each image", error.problem)
         if found is None or int(found[1]) >= len(images):
             raise
@@ -336,34 +336,36 @@ def capture_from_arrays(
     if not inside.any():
         raise InputError("capture: the mask is empty")
     around = None if as_stored else surroundings(inside)
-    sizes = int(inside.sum()), n_lights, white_level, 0 if around is None else int(around.sum())
 
-    def pixels() -> Iterator[linearise.StoredPixels]:
+    def read(colours: Float64Array | None) -> Iterator[linearise.StoredPixels]:
+        rgb = intensities if colours is None else intensities * colours
         for index, image in enumerate(stack):
             pixels = image if image.ndim == 3 else image[..., None]
             values, path = pixels[inside], Path(f"images[{index}]")
             used = values if around is None else np.concatenate((values, linearise.take_around(pixels, around)))
-            yield linearise.StoredPixels(path, values, linearise.linear_light(used, path), intensities[index])
+            yield linearise.StoredPixels(path, values, linearise.linear_light(used, path), rgb[index])
 
-    observations, saturation, warnings, colours = linearise.collect_observations(pixels(), *sizes)
-    if as_stored:
-        warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
-    if colours is not None:
-        intensities = intensities * colours
-        observations = linearise.collect_observations(pixels(), *sizes)[0]
-    blur = None if around is None else remove_blur(observations, inside, around)
-    observations = observations[: sizes[0]]
-    indices, level = tuple(range(n_lights)), saturation.white_level
-    capture = Capture("capture", observations, directions, indices, inside, warnings=tuple(warnings), white_level=level)
+    observed = linearise.read_observations(read, inside, around, n_lights, white_level, divides_colours=not as_stored)
     matrix = None if camera_matrix is None else np.asarray(camera_matrix, np.float64)
-    capture = replace(capture, estimated_colours=colours, camera_matrix=matrix, removed_blur=blur)
+    capture = Capture(
+        "capture",
+        observed.observations,
+        directions,
+        tuple(range(n_lights)),
+        inside,
+        warnings=tuple(observed.warnings),
+        estimated_colours=observed.colours,
+        white_level=observed.saturation.white_level,
+        removed_blur=observed.blur,
+        camera_matrix=matrix,
+    )
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
         lamps = near_lamps.NearLamps.of(positions, pixel_size, shape, equal=not known, camera_matrix=matrix)
-        warnings = [*warnings, *near_lamps.check_distances(lamps, inside, None)]
+        warnings = [*observed.warnings, *near_lamps.check_distances(lamps, inside, None)]
         capture = replace(capture, lamps=lamps, camera_matrix=None, warnings=tuple(warnings))
-    stored = StoredCapture(capture, saturation, intensities_known=known)
+    stored = StoredCapture(capture, observed.saturation, intensities_known=known)
     if light_directions is None and find_lights is not None:
         stored = stored.find_lights(find_lights)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())

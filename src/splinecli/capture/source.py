@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +29,6 @@ from splinecli.capture.linearise import AS_STORED, WHOLE, RadiometricCalibration
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
 from splinecli.capture_warnings import (
-    ESTIMATED_COLOURS,
     GROUND_TRUTH_UPSIDE_DOWN,
     IMAGES_ALIGNED,
     CaptureWarning,
@@ -50,7 +48,8 @@ from splinecli.restoration.alignment import (
     stride_for,
 )
 from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
-from splinecli.restoration.lens_blur import remove_blur, surroundings
+from splinecli.restoration.lens_blur import surroundings
+from splinecli.system.machine import in_order
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -77,7 +76,6 @@ class CaptureSource:
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     light_frame: LightFrame = USUAL_FRAME  # the frame of the light file, in which the directions are no longer
-    light_numbers: tuple[int, ...] | None = None  # zero-based numbers of the lights in their file; None for all
     lamps: LampFiles | None = None  # the near lamps of files and options, or None
     camera_matrix: Float64Array | None = None  # (3, 3) in pixels of whole images. None is an orthographic camera
     channels: ChannelLights | None = None  # if each channel of a colour image is an image of its own
@@ -93,7 +91,7 @@ class CaptureSource:
 
     def image_names(self, indices: Sequence[int]) -> list[str]:
         """Return the names of images for messages, with the channel if each channel is an image of its own."""
-        names, numbers = [self.files.images[index].name for index in indices], self.light_numbers
+        names, numbers = [self.files.images[index].name for index in indices], self.files.kept
         if self.channels is None:
             return names
         channels = ["RGB"[(index if numbers is None else numbers[index]) % 3] for index in indices]
@@ -101,13 +99,13 @@ class CaptureSource:
 
     def places_of(self, light_numbers: Sequence[int] | None) -> Sequence[int] | None:
         """Return the indices of lights from their numbers in the light file. Raises UsageError."""
-        if light_numbers is None or self.light_numbers is None:
+        if light_numbers is None or self.files.kept is None:
             return light_numbers
-        for number in check_light_indices(light_numbers, self.light_numbers[-1] + 1):
-            if number not in self.light_numbers:
+        for number in check_light_indices(light_numbers, self.files.kept[-1] + 1):
+            if number not in self.files.kept:
                 hint = "Leave it out: its direction is wrong"
                 raise UsageError(f"light {number} was left out, and cannot be chosen", hint=hint)
-        return [self.light_numbers.index(number) for number in light_numbers]
+        return [self.files.kept.index(number) for number in light_numbers]
 
     def read(
         self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None, *, as_stored: bool = False
@@ -136,7 +134,6 @@ class CaptureSource:
         progress: Progress = lambda: None,
         *,
         as_stored: bool = False,
-        divide_colours: bool = True,
     ) -> StoredCapture:
         """Return the values under the chosen lights and the data needed to restore the saturated ones; see read.
 
@@ -150,27 +147,20 @@ class CaptureSource:
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
             ground_truth = self.window.of(ground_truth)
-        n_pixels, around, n_around = int(np.count_nonzero(mask)), None, 0
-        if not as_stored and self.window.step == 1:
-            around = surroundings(mask)
-            n_around = int(np.count_nonzero(around))
-        images = self.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
-        collected = linearise.collect_observations(images, n_pixels, len(indices), self.white_level, n_around)
-        observations, saturation, warnings, colours = collected
-        equal = self.intensities_known and not self.intensities_measured
-        if equal or as_stored or not divide_colours:
-            warnings, colours = [each for each in warnings if each.kind != ESTIMATED_COLOURS], None
-        if colours is not None:  # only the mean of the channels was kept, so the images are read again
-            del images, collected, observations
+        around = surroundings(mask) if not as_stored and self.window.step == 1 else None
+
+        def images(colours: Float64Array | None) -> Iterator[StoredPixels]:
             rgb = self.light_intensities.copy()
-            rgb[list(indices)] *= colours
-            warnings = [each for each in warnings if each.kind == ESTIMATED_COLOURS]
-            again = replace(self, light_intensities=rgb, warnings=(*self.warnings, *warnings))
-            stored = again.read_stored(indices, progress, divide_colours=False)
-            return replace(stored, capture=replace(stored.capture, estimated_colours=colours))
-        blur = None if around is None else remove_blur(observations, mask, around)
-        observations = observations[:n_pixels]
-        warnings = [*self.warnings, *warnings]
+            if colours is not None:
+                rgb[list(indices)] *= colours
+            source = replace(self, light_intensities=rgb)
+            return source.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
+
+        equal = self.intensities_known and not self.intensities_measured
+        observed = linearise.read_observations(
+            images, mask, around, len(indices), self.white_level, divides_colours=not (equal or as_stored)
+        )
+        warnings = [*self.warnings, *observed.warnings]
         if upside_down:
             text = "The rows of the ground truth are in reverse order, so the map was flipped."
             warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
@@ -179,18 +169,19 @@ class CaptureSource:
         camera = None if lamps is not None or self.camera_matrix is None else self.window.camera(self.camera_matrix)
         capture = Capture(
             self.files.name,
-            observations,
+            observed.observations,
             self.light_directions[list(indices)],
             indices,
             mask,
             ground_truth,
             tuple(warnings),
-            white_level=saturation.white_level,
-            removed_blur=blur,
+            estimated_colours=observed.colours,
+            white_level=observed.saturation.white_level,
+            removed_blur=observed.blur,
             lamps=None if lamps is None else lamps.choose_lights(indices),
             camera_matrix=camera,
         )
-        stored = StoredCapture(capture, saturation, self.intensities_known)
+        stored = StoredCapture(capture, observed.saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
     def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
@@ -343,7 +334,7 @@ class CaptureSource:
             facts, intensity = self.facts[index], self.light_intensities[index]
             pixels = pixels_of(facts.path, index)
             if self.channels is not None:
-                number = index if self.light_numbers is None else self.light_numbers[index]
+                number = index if self.files.kept is None else self.files.kept[index]
                 pixels = self.channels.observe(facts.path, *pixels, number)
             return use(StoredPixels(facts.path, *pixels, intensity, facts.white_level))
 
@@ -376,20 +367,10 @@ class CaptureSource:
 def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
     """Yield read(item) of each item, in order. While one result is used, a thread reads the next.
 
-    An error is raised when its item is due. Decoders capture all output to file descriptor 2. If Python's stderr is the
-    same descriptor, the items are read one after the other, so that no message is lost.
+    Decoders capture all output to file descriptor 2. If Python's stderr is the same descriptor, the items are read one
+    after the other, so that no message is lost.
     """
-    if len(items) < 2 or not stderr_is_apart():
-        yield from map(read, items)
-        return
-    with ThreadPoolExecutor(1, "read") as pool:
-        waiting = pool.submit(read, items[0])
-        for item in items[1:]:
-            found = waiting.result()
-            waiting = pool.submit(read, item)
-            yield found
-            del found  # so that no more than two are in memory
-        yield waiting.result()
+    return map(read, items) if len(items) < 2 or not stderr_is_apart() else in_order(read, items)
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:

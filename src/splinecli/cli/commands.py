@@ -183,16 +183,8 @@ def train(options: TrainOptions) -> None:
     if options.minutes is not None:
         settings = replace(settings, minutes=options.minutes)
     messages = Messages(quiet=options.quiet)
-    start = open_run(
-        settings,
-        options.output,
-        options.device,
-        resume=resume,
-        tensorboard=options.tensorboard,
-        warn=messages.warn,
-        say=messages.say,
-    )
-    with start as trainer:
+    how: dict[str, Any] = {"resume": resume, "tensorboard": options.tensorboard, "observer": messages}
+    with open_run(settings, options.output, options.device, **how) as trainer:
         _run(trainer, Messages(quiet=options.quiet or not trainer.workers.leads))
         if not options.quiet and trainer.workers.leads:
             print(printable(options.output / defaults.WEIGHTS))

@@ -20,7 +20,7 @@ from splinecli.errors import SplinecliError, UsageError, printable
 from splinecli.records import listed
 from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
-from splinecli.system.progress import Advance, Observer
+from splinecli.system.progress import Advance, Observer, ignore
 
 DEFECT = "this is a defect of splinecli; please report it with the lines above."  # for unexpected errors
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
@@ -167,7 +167,7 @@ class Messages(Observer):
     @contextmanager
     def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
         if self.quiet:
-            yield lambda amount, note="": None
+            yield ignore
         elif sys.stderr.isatty():
             with _bar(label, total, start, unit) as advance:
                 yield advance

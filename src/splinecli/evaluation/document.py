@@ -7,20 +7,20 @@ import csv
 import io
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from splinecli import __version__
-from splinecli.documents import ComparisonReport, ProtocolReport, RelightingReport
+from splinecli.documents import ComparisonReport, MethodResult, ProtocolReport, RelightingReport
 from splinecli.errors import printable
 from splinecli.evaluation import protocol as protocol_module
 from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
-from splinecli.evaluation.tables import AVERAGE, Comparison, compare, table_rows
+from splinecli.evaluation.tables import AVERAGE, compare, table_rows
 from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
@@ -144,7 +144,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
     return [[Cell("method"), *(Cell(printable(capture)) for capture in evaluation.captures)], *body]
 
 
-def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
+def _matrix(methods: Sequence[str], comparisons: Sequence[ComparisonReport]) -> Table:
     """Return a table of MAE differences, row method minus column method; significant ones are marked."""
     cells = {}
     for c in comparisons:
@@ -155,7 +155,7 @@ def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
 
-def _pair_row(c: Comparison) -> dict[str, str]:
+def _pair_row(c: ComparisonReport) -> dict[str, str]:
     if c.interval_deg is None or c.p_holm is None:
         interval = p_value = "not tested"
     else:
@@ -189,7 +189,6 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-_DIGITS = 4  # decimal places of degrees and seconds
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 
 
@@ -250,44 +249,21 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         "schema": 1,
         "protocol": _protocol_record([evaluation.protocol for evaluation in evaluations]),
         "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
-        "results": [
-            {**record, "maes_deg": [_rounded(mae_deg) for mae_deg in result.maes_deg]}
-            for record, result in zip(_records(evaluations), (r for e in evaluations for r in e.results), strict=True)
-        ],
+        "results": _records(evaluations),
         "averages": _averages(evaluations),
-        "comparisons": [record for evaluation in evaluations for record in _comparisons(evaluation)],
-        "skipped": [{"capture": s.capture, "reason": s.reason} for s in protocol_module.all_skipped(evaluations)],
+        "comparisons": [_rounded(c.as_dict()) for evaluation in evaluations for c in compare(evaluation)],
+        "skipped": [skipped.as_dict() for skipped in protocol_module.all_skipped(evaluations)],
         "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)),
         "version": __version__,
     }
-
-
-def _comparisons(evaluation: Evaluation) -> list[dict[str, Any]]:
-    return [
-        ComparisonReport(
-            first=c.first,
-            second=c.second,
-            capture=c.capture,
-            n_lights=lights_value(evaluation.protocol),
-            light_noise_deg=evaluation.protocol.light_noise_deg,
-            trials=c.trials,
-            difference_deg=round(c.difference_deg, _DIGITS),
-            std_deg=round(c.std_deg, _DIGITS),
-            interval_deg=None
-            if c.interval_deg is None
-            else (round(c.interval_deg[0], _DIGITS), round(c.interval_deg[1], _DIGITS)),
-            p_value=_significant(c.p_value),
-            p_holm=_significant(c.p_holm),
-            differs=c.differs,
-        ).as_dict()
-        for c in compare(evaluation)
-    ]
 
 
 def results_csv(evaluations: Sequence[Evaluation]) -> str:
     """Return a header and a line for each result, with the names and values of `results` in results.json."""
     text = io.StringIO()
     records = _records(evaluations)
+    for record in records:
+        del record["maes_deg"]
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(records[0])
     writer.writerows(map(_as_text_cell, record.values()) for record in records)
@@ -320,28 +296,19 @@ def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
 
 
 def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
+    """Return the fields of MethodResult of each result, from the result or from its protocol."""
+    names = MethodResult.__struct_fields__
+    pairs = [(result, e.protocol) for e in evaluations for result in e.results]
     return [
-        {
-            "method": result.method,
-            "capture": result.capture,
-            "n_lights": result.n_lights,
-            "light_noise_deg": evaluation.protocol.light_noise_deg,
-            "mae_deg": _rounded(result.mae_deg),
-            "std_deg": _rounded(result.std_deg),
-            "trials": result.trials,
-            "seconds": _rounded(result.seconds),
-            "as_stored": evaluation.protocol.as_stored,
-            "found_light_error_deg": _rounded(result.found_light_error_deg),
-        }
-        for evaluation in evaluations
-        for result in evaluation.results
+        _rounded({name: getattr(result if hasattr(result, name) else protocol, name) for name in names})
+        for result, protocol in pairs
     ]
 
 
 def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    averages = [{method: _rounded(value) for method, value in e.averages.items()} for e in evaluations]
+    averages = [_rounded(e.averages) for e in evaluations]
     if len(evaluations) == 1:
-        return dict(averages[0])
+        return averages[0]
     # The values that differ between the evaluations: "10", "all"; "0", "2.5"; or both, "10, 2.5".
     lights = [str(lights_value(e.protocol)) for e in evaluations]
     noise = [f"{e.protocol.light_noise_deg:g}" for e in evaluations]
@@ -351,13 +318,20 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     return {method: {key: average[method] for key, average in zip(keys, averages, strict=True)} for method in methods}
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, _DIGITS)
+def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with degrees and seconds to four decimals; the light noise is as given.
 
+    p-values span many orders of magnitude, so they have three significant digits.
+    """
 
-def _significant(p_value: float | None) -> float | None:
-    # Three significant digits, because p-values span many orders of magnitude
-    return None if p_value is None else float(f"{p_value:.3g}")
+    def rounded(name: str, value: Any) -> Any:
+        if isinstance(value, tuple):
+            return [rounded(name, each) for each in value]
+        if not isinstance(value, float) or name == "light_noise_deg":
+            return value
+        return float(f"{value:.3g}") if name.startswith("p_") else round(value, 4)
+
+    return {name: rounded(name, value) for name, value in values.items()}
 
 
 def _one_or_list(values: Sequence[Any]) -> Any:

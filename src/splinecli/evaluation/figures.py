@@ -1,6 +1,8 @@
-"""Figures of evaluations: the error against a setting, and maps and observation maps of single captures.
+"""Figures of evaluations: the error against a setting, maps and observation maps of single captures, and relighting.
 
 Curves show only the captures that all evaluations scored, so that every point of an average covers the same captures.
+Relighting compares photographs under lights that a draw leaves out with pictures of the material estimated from the
+others.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,19 +18,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import Capture, open_capture
+from splinecli.capture import Capture
+from splinecli.documents import Likeness, RelightingReport
 from splinecli.errors import UsageError, printable
 from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
-from splinecli.evaluation.run import draws_for, read_draws_file
+from splinecli.evaluation.run import read_first_draw
 from splinecli.evaluation.tables import AVERAGE, trial_averages
-from splinecli.evaluation.trials import Trial, TrialSource
 from splinecli.inference import estimate_normals
+from splinecli.maths import Float32Array, Floats
 from splinecli.methods import METHODS, Estimator
 from splinecli.pictures.plots import method_maps, method_styles, observation_map_figure, png_bytes
+from splinecli.results.maps import agreeing_lights
+from splinecli.results.material import material_of
 from splinecli.system.files import free_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
 
 MOST_CAPTURES = 4  # with a panel each. With more, only the average is plotted, to keep the figure legible
 _PANEL_INCHES = (3.2, 2.7)
@@ -183,13 +190,8 @@ def capture_figures(
     the tables, and `stem` is the stem of the files. `advance` is called with the fraction of the work just completed.
     Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
     """
-    source = open_capture(folder, white_level=protocol.white_level)
-    read, draws_file = read_draws_file(protocol)
-    trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
-    lights = range(protocol.skipped_lights(name), source.n_lights)
     steps = 1 + len(estimators)
-    stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps), as_stored=protocol.as_stored)
-    capture = TrialSource(stored).see(trial)
+    stored, capture = read_first_draw(folder, name, protocol, lambda share: advance(share / steps))
     assert capture.ground_truth is not None  # otherwise there would be no first trial
     normals: dict[str, NDArray[np.float32]] = {}
     errors_deg: dict[str, NDArray[np.float32]] = {}
@@ -200,7 +202,7 @@ def capture_figures(
         assert estimate.error_map_deg is not None
         normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
     # The largest number of lights listed in a title.
-    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= 16 else ""
+    listed = f" ({', '.join(map(str, capture.light_indices))})" if capture.n_lights <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
@@ -260,3 +262,59 @@ def _observation_maps(
         title=title,
         grid=maps.grid,
     )
+
+
+def relight_first_draw(
+    folder: Path, name: str, estimator: Estimator, protocol: Protocol, advance: Callable[[float], object]
+) -> RelightingReport:
+    """Return how well the material from the protocol's first draw predicts the photographs under the other lights.
+
+    `name` is the capture's in the tables, and `advance` is called with the fraction of the images just read. Raises
+    UsageError if no light is left, or the lamps or the camera are near; InputError if the capture cannot be read, or
+    too few lights are used.
+    """
+    from splinecli.materials.maps import lights_that_reach, render_gray
+
+    stored, given = read_first_draw(folder, name, protocol, advance)
+    whole = stored.capture
+    held = [place for place, light in enumerate(whole.light_indices) if light not in given.light_indices]
+    if not held:
+        raise UsageError(f"{name}: the draw uses all lights, so none is held out", hint="Use a smaller --n-lights")
+    if whole.lamps is not None or whole.camera_matrix is not None:
+        raise UsageError(f"{name}: --relight needs distant lights and an orthographic camera")
+    estimate = estimate_normals(given, estimator)
+    normals = estimate.normal_map[given.mask]
+    confidence = None if estimate.confidence_map is None else estimate.confidence_map[given.mask]
+    lights = whole.light_directions[held]
+    reached = lights_that_reach(estimate.normal_map, given.mask, lights)
+    nearest = (lights @ given.light_directions.T).argmax(axis=1)
+    judge = partial(likeness, whole.observations[:, held])
+    return RelightingReport(
+        capture=name,
+        method=estimator.name,
+        lights=list(given.light_indices),
+        held_out=len(held),
+        material=judge(render_gray(material_of(estimate), normals, lights, reached, confidence)),
+        lambertian=judge(lambertian(given, normals, lights) * reached),
+        nearest=judge(given.observations[:, nearest]),
+    )
+
+
+def likeness(photographs: Float32Array, pictures: Float32Array) -> Likeness:
+    """Compare pictures with photographs, both (P, F) and linear. The photographs are not all black.
+
+    White is the 0.999 quantile of the photographs; brighter values are clipped.
+    """
+    white = max(float(np.quantile(photographs, 0.999)), 1e-12)
+    wrong = np.minimum(pictures, white) - np.minimum(photographs, white)
+    square = max(float(np.square(wrong, dtype=np.float64).mean()) / white**2, 1e-12)
+    error = float(np.abs(wrong).mean() / photographs.mean())
+    return Likeness(psnr_db=round(-10 * float(np.log10(square)), 2), error=round(error, 4))
+
+
+def lambertian(given: Capture, normals: Float32Array, lights: Floats) -> Float32Array:
+    """Return pictures (P, F) of a matte surface under lights (F, 3), with the albedo that `infer` computes."""
+    cosines = (normals @ given.light_directions.T).astype(np.float32)
+    weights = agreeing_lights(given.observations, cosines) * cosines
+    albedo = (weights * given.observations).sum(axis=1) / np.maximum((weights * cosines).sum(axis=1), 1e-6)
+    return np.asarray(albedo[:, None] * (normals @ lights.T).clip(0), np.float32)

@@ -11,6 +11,7 @@ import numpy as np
 
 from splinecli.capture.formats.numbers import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
+from splinecli.documents import SkippedCapture
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 
@@ -215,20 +216,12 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Skipped:
-    """A capture that could not be scored, and the reason."""
-
-    capture: str
-    reason: str
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """The outcome of one protocol."""
 
     protocol: Protocol  # the protocol; n_lights and trials are taken from the draws file, if given
     results: tuple[Result, ...]  # one per capture and method, ordered by capture as given, then by method
-    skipped: tuple[Skipped, ...] = ()  # the captures that could not be scored
+    skipped: tuple[SkippedCapture, ...] = ()  # the captures that could not be scored
     notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
     # "weights", "device", "precision" and "fingerprint" of each method by name; see Estimator
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -250,6 +243,6 @@ class Evaluation:
         }
 
 
-def all_skipped(evaluations: Sequence[Evaluation]) -> list[Skipped]:
+def all_skipped(evaluations: Sequence[Evaluation]) -> list[SkippedCapture]:
     """Return the captures skipped by any of the evaluations; repeated reasons are listed once."""
-    return list(dict.fromkeys(skipped for e in evaluations for skipped in e.skipped))
+    return list({(each.capture, each.reason): each for e in evaluations for each in e.skipped}.values())

@@ -14,14 +14,24 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 from splinecli import __version__
-from splinecli.capture import CaptureSource, capture_name
+from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
 from splinecli.capture.files import digest
-from splinecli.capture.record import MIN_LIGHTS
+from splinecli.capture.record import MIN_LIGHTS, StoredCapture
+from splinecli.documents import SkippedCapture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation import protocol as protocol_module
-from splinecli.evaluation.protocol import Draw, DrawsFile, Evaluation, Protocol, Result, Skipped
+from splinecli.evaluation.protocol import Draw, DrawsFile, Evaluation, Protocol, Result
 from splinecli.evaluation.tables import AVERAGE
-from splinecli.evaluation.trials import CaptureReading, Notes, Score, SharedDraw, Trial, TrialStore, open_to_score
+from splinecli.evaluation.trials import (
+    CaptureReading,
+    Notes,
+    Score,
+    SharedDraw,
+    Trial,
+    TrialSource,
+    TrialStore,
+    open_to_score,
+)
 from splinecli.lights.light_fit import check_distant
 from splinecli.methods import Estimator
 
@@ -62,7 +72,9 @@ class ProtocolTrials:
             kind = UsageError if all(isinstance(failure, UsageError) for failure in failures) else InputError
             first = str(failures[0]).removesuffix(".")
             raise kind(f"none of the {len(failures)} captures could be scored; the first: {first}")
-        skipped = (Skipped(name, str(self.failures[name])) for name in captures if name in self.failures)
+        skipped = (
+            SkippedCapture(capture=name, reason=str(self.failures[name])) for name in captures if name in self.failures
+        )
         notes = [note for name in captures for note in self.notes.get(name, ())]
         notes += [
             f"{name}: no file gives the light intensities; they were estimated in {count} of {of} trials."
@@ -169,6 +181,22 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
     draws = [tuple(light + skipped for light in draw) for draw in draws]
     # All lights form one draw, but their noise differs from trial to trial.
     return draws * trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
+
+
+def read_first_draw(
+    folder: Path, name: str, protocol: Protocol, progress: Callable[[float], object] = lambda share: None
+) -> tuple[StoredCapture, Capture]:
+    """Return a capture under all lights that are not skipped, and under the protocol's first draw.
+
+    `progress` is called with the fraction of the images just read. Raises InputError or UsageError if the capture
+    cannot be read or scored.
+    """
+    source = open_capture(folder, white_level=protocol.white_level)
+    protocol, draws_file = read_draws_file(protocol)
+    trial = Trial(name, "", 0, draws_for(source, name, protocol, draws_file)[0], protocol, "")
+    lights = range(protocol.skipped_lights(name), source.n_lights)
+    stored = source.read_stored(lights, lambda: progress(1 / len(lights)), as_stored=protocol.as_stored)
+    return stored, TrialSource(stored).see(trial)
 
 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:

@@ -11,56 +11,33 @@ methods that differ in n_lights, light_noise_deg or both.
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.documents import ComparisonReport
 from splinecli.errors import printable
-from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
+from splinecli.evaluation.protocol import Evaluation, heading, lights_value, protocol_in_words
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ
 _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are considered equal
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The difference of two methods on one capture, or on the average over the captures, trial by trial.
-
-    With one trial, or if the differences of all trials are equal but not zero, no test is possible, and interval_deg,
-    p_value and p_holm are None. If all differences are zero, the interval is (0, 0) and p is 1.
-    """
-
-    capture: str  # name of the capture, or AVERAGE
-    first: str
-    second: str
-    trials: int
-    # mean over the trials of MAE(`first`) - MAE(`second`); `first` is better below 0
-    difference_deg: float
-    std_deg: float  # population standard deviation of the differences
-    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
-    interval_deg: tuple[float, float] | None
-    p_value: float | None
-    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
-
-    @property
-    def differs(self) -> bool | None:
-        """Whether p_holm is below SIGNIFICANCE; None without a test."""
-        return None if self.p_holm is None else self.p_holm < SIGNIFICANCE
-
-
-def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
+def compare(evaluation: Evaluation) -> list[ComparisonReport]:
     """Return the comparison of every pair of methods on every capture, then on the average over the captures.
 
     Trial t of the average is the mean of trial t over the captures. See trial_averages.
     """
-    comparisons: list[Comparison] = []
-    for capture in evaluation.captures:
-        comparisons += _compare_all(capture, {r.method: r.maes_deg for r in evaluation.results if r.capture == capture})
-    averages = {method: trial_averages(evaluation, method) for method in evaluation.methods}
-    return (*comparisons, *_compare_all(AVERAGE, averages))
+    errors = {
+        name: {r.method: r.maes_deg for r in evaluation.results if r.capture == name} for name in evaluation.captures
+    }
+    errors[AVERAGE] = {method: trial_averages(evaluation, method) for method in evaluation.methods}
+    protocol = evaluation.protocol
+    settings = {"n_lights": lights_value(protocol), "light_noise_deg": protocol.light_noise_deg}
+    return [each for capture, of in errors.items() for each in _compare_all(of, capture=capture, **settings)]
 
 
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
@@ -75,9 +52,8 @@ def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     return tuple(float(np.mean(trial)) for trial in zip(*repeated, strict=False))
 
 
-def in_words(comparison: Comparison) -> str:
+def in_words(c: ComparisonReport) -> str:
     """Return a sentence that describes a comparison."""
-    c = comparison
     better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
     size = f"{abs(c.difference_deg):.2f} degrees"
     if c.interval_deg is None or c.p_holm is None:
@@ -98,15 +74,28 @@ def p_in_words(p_value: float) -> str:
     return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}" if p_value < 0.1 else f"p = {p_value:.2f}"
 
 
-def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[Comparison]:
+def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> list[ComparisonReport]:
     compared = []
     for first, second in combinations(maes_deg, 2):
         differences = np.subtract(maes_deg[first], maes_deg[second])
-        mean, std = float(differences.mean()), float(differences.std())
-        test = _paired_test(differences)
-        compared.append(Comparison(capture, first, second, len(differences), mean, std, *test, None))
-    corrected = iter(holm([c.p_value for c in compared if c.p_value is not None]))
-    return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
+        interval_deg, p_value = _paired_test(differences)
+        comparison = ComparisonReport(
+            first=first,
+            second=second,
+            trials=len(differences),
+            difference_deg=float(differences.mean()),
+            std_deg=float(differences.std()),
+            interval_deg=interval_deg,
+            p_value=p_value,
+            p_holm=None,
+            differs=None,
+            **settings,
+        )
+        compared.append(comparison)
+    tested = [(c, c.p_value) for c in compared if c.p_value is not None]
+    for (c, _), p_holm in zip(tested, holm([p_value for _, p_value in tested]), strict=True):
+        c.p_holm, c.differs = p_holm, p_holm < SIGNIFICANCE
+    return compared
 
 
 def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] | None, float | None]:

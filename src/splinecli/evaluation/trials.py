@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -12,6 +13,8 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
+from msgspec import MsgspecError, Struct, structs
+from msgspec import json as msgspec_json
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
@@ -26,8 +29,8 @@ from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
-from splinecli.system.files import as_splinecli_error, parse_json, refusals_as_output_errors, write_text
-from splinecli.system.progress import Progress
+from splinecli.system.files import as_splinecli_error, refusals_as_output_errors, write_text
+from splinecli.system.progress import Progress, ignore
 from splinecli.system.publishing import is_plain
 
 
@@ -65,14 +68,19 @@ class Trial:
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(Struct, frozen=True):
     """The score of a trial."""
 
     mae_deg: float  # mean angular error over the scored pixels
     seconds: float  # time spent on estimating their normals
     estimated_intensities: bool  # whether the light intensities were estimated from the images
     found_light_error_deg: float | None = None  # mean error of light directions that were estimated from the images
+
+
+class _Line(Score, frozen=True, kw_only=True):
+    """The part of a stored line that is read again; the rest describes the trial for people."""
+
+    key: str
 
 
 class TrialStore:
@@ -93,9 +101,10 @@ class TrialStore:
             if is_plain(path) and not fresh:
                 with path.open(encoding="utf-8", errors="replace") as file:
                     while line := file.readline(1 << 16):  # longer lines are read in parts
-                        if (read := _read_line(line)) is not None:
+                        with suppress(MsgspecError, RecursionError):
+                            read = msgspec_json.decode(line, type=_Line)
                             kept.append(line.rstrip("\n") + "\n")
-                            self._scores.update((read,))
+                            self._scores[read.key] = read
             # Write a new file, because appending would also change any hard link to the old one.
             if os.path.lexists(path):
                 write_text(path, "".join(kept))
@@ -110,20 +119,9 @@ class TrialStore:
             self._scores[trial.key] = score
             if self._path is None:
                 return
-            line = json.dumps({**trial.record, **asdict(score), "key": trial.key})
+            line = json.dumps({**trial.record, **structs.asdict(score), "key": trial.key})
             with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
-
-
-def _read_line(line: str) -> tuple[str, Score] | None:
-    try:
-        record = parse_json(line)
-        key, score = record["key"], Score(**{field.name: record.get(field.name) for field in fields(Score)})
-    except (ValueError, TypeError, KeyError, AttributeError):
-        return None
-    usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)
-    usable = usable and isinstance(score.estimated_intensities, bool)
-    return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
 
 
 OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
@@ -182,7 +180,9 @@ class SharedDraw:
         self._lock = Lock()
         self._captures: dict[bool, Capture] = {}
 
-    def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
+    def score(
+        self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] = lambda n_pixels: ignore
+    ) -> Score:
         """Return the score of a trial of the draw. Any thread may call this.
 
         `begin` is called with the number of pixels before they are estimated and returns a function that counts
@@ -193,7 +193,7 @@ class SharedDraw:
             if whole not in self._captures:
                 self._captures[whole] = source.see(trial, whole=whole)
         capture = self._captures[whole]
-        estimate = estimate_normals(capture, estimator, progress=None if begin is None else begin(capture.n_pixels))
+        estimate = estimate_normals(capture, estimator, progress=begin(capture.n_pixels))
         assert estimate.errors is not None and estimate.error_map_deg is not None  # otherwise there would be no trials
         mae_deg = estimate.errors.mean
         if source.rows is not None and capture.n_pixels != len(source.rows):

@@ -28,7 +28,7 @@ from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork, untrained_warning
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.machine import one_thread_each, side_by_side
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Progress, ignore
 
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
@@ -50,7 +50,7 @@ class BatchedEstimator(Estimator):
         self.fingerprint = f"{name} {self.precision}"
 
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> NDArray[np.float32]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
 
@@ -81,7 +81,7 @@ def estimate_in_batches(
     device: str,
     dtype: torch.dtype,
     columns: int = 3,
-    progress: Progress | None = None,
+    progress: Progress = ignore,
 ) -> NDArray[np.float32]:
     """Call `solve` on batches of observations, side by side, and return its results (P, columns) as float32.
 
@@ -101,8 +101,7 @@ def estimate_in_batches(
         return len(batch)
 
     for count in side_by_side(solve_batch, range(0, len(observations), batch_size)):
-        if progress is not None:
-            progress(count)
+        progress(count)
     return results
 
 
@@ -172,14 +171,8 @@ class NetworkEstimator(Estimator):
             found._contexts = [self.network.encode_context(sample, lights, rotation) for rotation in self._rotations]
         return found
 
-    def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
-    ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
-        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
-
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 

@@ -32,7 +32,7 @@ from splinecli.methods.estimator import (
 )
 from splinecli.networks.li_ne_net import median_error_deg
 from splinecli.system.machine import one_thread_each, side_by_side
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Progress, ignore
 
 CELLS = 256  # number of groups of pixels of like appearance
 EVEN_SHARE = 0.5  # Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups.
@@ -174,7 +174,7 @@ class Perceptron(nn.Module):
         *,
         steps: int,
         generator: torch.Generator,
-        progress: Callable[[], object] | None = None,
+        progress: Callable[[], object],
     ) -> None:
         """Learn the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls `progress` after each step."""
         with torch.no_grad():
@@ -198,8 +198,7 @@ class Perceptron(nn.Module):
             loss.backward()
             optimiser.step()
             schedule.step()
-            if progress is not None:
-                progress()
+            progress()
 
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
@@ -262,14 +261,8 @@ class DistilledEstimator(Estimator):
             "unlike_pixels": self.n_unlike,
         }
 
-    def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
-    ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under the capture's lights; see Estimator."""
-        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
-
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see Estimator."""
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
@@ -288,8 +281,7 @@ class DistilledEstimator(Estimator):
 
         tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
         for rows in side_by_side(apply, tiles):
-            if progress is not None:
-                progress(int(np.count_nonzero(~unlike[rows])))
+            progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
             taught = self._teacher.estimate_with_error(
@@ -306,7 +298,7 @@ def distil(
     size: StudentSize,
     *,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = ignore,
 ) -> DistilledEstimator:
     """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of the pixels.
 
@@ -339,7 +331,7 @@ def distil(
         def count() -> None:
             nonlocal done
             done += share
-            if progress is not None and done >= 1:
+            if done >= 1:
                 progress(int(done))
                 done -= int(done)
 

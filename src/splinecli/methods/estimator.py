@@ -7,7 +7,6 @@ images", 1980.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from splinecli.fits.robust import solve_each
 from splinecli.maths.normals import unit
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Progress, ignore
 
 if TYPE_CHECKING:
     from splinecli.lights.lighting import LightingAt
@@ -61,7 +60,7 @@ def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) ->
 TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
 
 
-class Estimator(ABC):
+class Estimator:
     """A method that estimates the normals of pixels from their observations, and all hooks that a method may have.
 
     A method without a hook inherits the one that does nothing.
@@ -83,18 +82,19 @@ class Estimator(ABC):
     tile_pixels: int = TILE_PIXELS
     refiner: NetworkRefiner | None = None
 
-    @abstractmethod
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> NDArray[np.floating]:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
         A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations are (P, F), the light
-        directions (F, 3) or (P, F, 3). `progress` is called after each batch with the number of its pixels.
+        directions (F, 3) or (P, F, 3). `progress` is called after each batch with the number of its pixels. A method
+        without confidence overrides this, all others estimate_with_error.
         """
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
         """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
@@ -164,7 +164,7 @@ class LeastSquares(Estimator):
     name = fingerprint = "ls"
 
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
     ) -> NDArray[np.float64]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
         values = observations.astype(np.float64)
@@ -174,6 +174,5 @@ class LeastSquares(Estimator):
             scaled = solve_each(values, light_directions)
         normals: NDArray[np.float64] = unit(scaled)
         normals[~scaled.any(axis=1)] = TOWARDS_CAMERA
-        if progress is not None:
-            progress(len(normals))
+        progress(len(normals))
         return normals

@@ -134,15 +134,17 @@ def check_length(path: Path, hint: str) -> None:
         raise ModelError(found, path=path, hint=hint)
 
 
-def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str, Any]:
-    """Return the JSON object under a key of a file's metadata. The checksum does not cover it. Raises ModelError."""
+def read_json_entry(metadata: dict[str, str], key: str, path: Path, kind: Any = dict[str, Any]) -> Any:
+    """Return the JSON object under a key of a file's metadata, or the record of this kind. Raises ModelError.
+
+    The checksum does not cover it.
+    """
     try:
-        values = parse_json(metadata.get(key, ""))
+        return parse_json(metadata.get(key, ""), kind)
     except ValueError as error:
-        raise ModelError(f"the entry {key!r} in the file is not JSON", path=path) from error
-    if not isinstance(values, dict):
-        raise ModelError(f"the entry {key!r} in the file is not a JSON object", path=path)
-    return values
+        raise ModelError(
+            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path=path
+        ) from error
 
 
 def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:

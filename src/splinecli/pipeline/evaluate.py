@@ -6,16 +6,16 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache, partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from splinecli.capture import find_captures, open_capture
 from splinecli.documents import RelightingReport
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.document import TRIALS, write_results
-from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems
+from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems, relight_first_draw
 from splinecli.evaluation.protocol import Evaluation, Protocol
-from splinecli.evaluation.relighting import relight_first_draw
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
 from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
 from splinecli.methods import Estimator, MethodOptions, make_estimator
@@ -25,8 +25,10 @@ from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.pipeline.options import EvaluateOptions
 from splinecli.system.files import check_writable
 from splinecli.system.machine import count_available_cores
-from splinecli.system.progress import SILENT, Observer
+from splinecli.system.progress import SILENT, Advance, Observer
 from splinecli.system.publishing import held_folder
+
+Found = TypeVar("Found")
 
 
 class EvaluateOutcome(NamedTuple):
@@ -67,13 +69,22 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
                 elsewhere=elsewhere,
                 on_progress=advance,
             )
+        protocol, scored = evaluations[0].protocol, evaluations[0].captures
+        folders = {name: folder for folder, name in distinct_names(captures).items() if name in scored}
         figures: list[CaptureFigure] | None = None
+        relit: list[RelightingReport] | None = None
         problems: list[str] = []
         if options.figures:
-            figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-        relit: list[RelightingReport] | None = None
+            draws = [
+                partial(capture_figures, folder, name, stem, estimators, protocol, options.pixels)
+                for (name, folder), stem in zip(folders.items(), file_stems(list(folders)), strict=True)
+            ]
+            drawn, problems = _try_each("drawing", draws, observer)
+            figures = list(chain.from_iterable(drawn))
         if options.relight:
-            relit, failed = _relight(captures, estimators, evaluations[0], observer)
+            pairs = [(name, estimator) for name in folders for estimator in estimators]
+            tasks = [partial(relight_first_draw, folders[name], name, each, protocol) for name, each in pairs]
+            relit, failed = _try_each("relighting", tasks, observer)
             problems += failed
         document = write_results(output, evaluations, figures, relit)
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
@@ -93,41 +104,18 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
             raise UsageError(problem, hint=f"Use --n-lights {most}, or fewer")
 
 
-def _draw_figures(
-    captures: Sequence[Path],
-    estimators: Sequence[Estimator],
-    evaluation: Evaluation,
-    pixels: Sequence[tuple[int, int]],
-    observer: Observer,
-) -> tuple[list[CaptureFigure], list[str]]:
-    folders = {name: folder for folder, name in distinct_names(captures).items()}
-    names = [name for name in folders if name in evaluation.captures]
-    figures: list[CaptureFigure] = []
+def _try_each(
+    label: str, tasks: Sequence[Callable[[Advance], Found]], observer: Observer
+) -> tuple[list[Found], list[str]]:
+    """Return the results of tasks, each given the function that counts its progress, and why others failed."""
+    found: list[Found] = []
     problems: list[str] = []
-    with observer.progress("drawing", len(names)) as advance:
-        for name, stem in zip(names, file_stems(names), strict=True):
+    with observer.progress(label, len(tasks)) as advance:
+        for task in tasks:
             try:
-                figures += capture_figures(folders[name], name, stem, estimators, evaluation.protocol, pixels, advance)
+                found.append(task(advance))
             except (InputError, UsageError) as error:
                 problems.append(str(error))
-    return figures, problems
-
-
-def _relight(
-    captures: Sequence[Path], estimators: Sequence[Estimator], evaluation: Evaluation, observer: Observer
-) -> tuple[list[RelightingReport], list[str]]:
-    """Return the relighting of each scored capture by each method, and why others could not be relit."""
-    folders = {name: folder for folder, name in distinct_names(captures).items()}
-    tasks = [(name, estimator) for name in folders if name in evaluation.captures for estimator in estimators]
-    found: list[RelightingReport] = []
-    problems: list[str] = []
-    with observer.progress("relighting", len(tasks)) as advance:
-        for name, estimator in tasks:
-            try:
-                found.append(relight_first_draw(folders[name], name, estimator, evaluation.protocol))
-            except (InputError, UsageError) as error:
-                problems.append(str(error))
-            advance(1)
     return found, problems
 
 

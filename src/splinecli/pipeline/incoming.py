@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec import Struct, to_builtins
+
 from splinecli.capture.files import digest, natural_key, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError, OutputError, UsageError
@@ -38,7 +40,8 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
     refuse_link(folder.parent)
     refuse_link(folder)
     with held_folder(folder, observer.warn):
-        of_film, sizes = _earlier(folder)
+        earlier = _earlier(folder)
+        of_film, sizes = earlier.sha256, earlier.frames
         # Other files would be mistaken for photographs, or for a mask.
         known = {*sizes, _RECORD}
         others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
@@ -59,19 +62,26 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
         with new_files(folder, report=_RECORD, stale=sizes) as new:
             for name, frame in zip(names, read_frames(capture, numbers), strict=True):
                 new.write(name, encode_png(frame, film=True))
-            record = {"film": str(capture), "sha256": stamp, "frames": new.sizes}
-            new.write(_RECORD, json.dumps(record, indent=2) + "\n")
+            record = _Film(str(capture), stamp, new.sizes)
+            new.write(_RECORD, json.dumps(to_builtins(record), indent=2) + "\n")
     return folder
 
 
-def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
-    """Return the stamp of the film whose frames are in the folder, and their sizes; empty without such frames."""
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        record = read_json(folder / _RECORD)
-        frames = {str(name): int(size) for name, size in record["frames"].items()}
-        if len(frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, frames)):
-            return str(record["sha256"]), frames
-    return "", {}
+class _Film(Struct):
+    """The film of a folder of frames, and their sizes."""
+
+    film: str
+    sha256: str
+    frames: dict[str, int]
+
+
+def _earlier(folder: Path) -> _Film:
+    """Return the record of the film whose frames are in the folder; empty without such frames."""
+    with suppress(OSError, ValueError):
+        record: _Film = read_json(folder / _RECORD, _Film)
+        if len(record.frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, record.frames)):
+            return record
+    return _Film("", "", {})
 
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds

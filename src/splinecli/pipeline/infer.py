@@ -229,8 +229,8 @@ def infer_capture(
             distillation=None if distilled is None else distilled.report(),
             alignment=None if source.alignment is None else source.alignment.as_dict(capture.light_indices),
         )
-        if source.light_numbers is not None:
-            report["light_indices"] = [source.light_numbers[index] for index in report["light_indices"]]
+        if source.files.kept is not None:
+            report["light_indices"] = [source.files.kept[index] for index in report["light_indices"]]
         found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write", note="writing")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from splinecli.capture import read_image, read_normal_map
@@ -268,12 +269,18 @@ def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     )
 
 
+class _Listing(Struct):
+    """The part of a report that lists its files."""
+
+    files: list[str]
+
+
 def _earlier_files(folder: Path) -> list[str]:
     """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer` are kept."""
     try:
-        named = read_json(folder / SURFACE_REPORT)["files"]
+        named = read_json(folder / SURFACE_REPORT, _Listing).files
         return [name for name in (*surface_files.file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return []
 
 

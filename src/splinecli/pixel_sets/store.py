@@ -11,16 +11,17 @@ Sets are written entry by entry, so that an interrupted command can continue. Tr
 
 import hashlib
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, ValidationError, convert, to_builtins
 from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import InputError, OutputError
+from splinecli.records import Count
 from splinecli.system.files import check_writable, file_sha256, read_json, write_text
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.publishing import LOCK, new_files
@@ -40,17 +41,26 @@ class Pixels:
     mask: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(Struct, frozen=True):
     """The description of an entry in the manifest."""
 
     name: str  # the folder of the entry, unique in its set
     scene: str  # entries of one scene have the same shape, so they are all for training or all for validation
     source: str  # description of where the pixels come from, for the user
     recipe: dict[str, Any]  # plain values that determine the content of the entry
-    n_pixels: int  # P
-    n_lights: int  # F
+    n_pixels: Count  # P
+    n_lights: Count  # F
     sha256: dict[str, str]  # checksum of each array file, by the name of the array
+
+
+class Manifest(Struct):
+    """The manifest of a set."""
+
+    format: str
+    version: str
+    complete: bool  # whether the set is finished
+    n_pixels: int
+    entries: tuple[Entry, ...]
 
 
 @dataclass(frozen=True)
@@ -85,11 +95,11 @@ def open_pixel_set(folder: Path) -> PixelSet:
     Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error names the file.
     """
     manifest = read_manifest(folder)
-    if manifest.get("complete") is not True:
+    if not manifest.complete:
         raise InputError(
             "the pixel set is not finished", path=folder, hint="Run the same 'splinecli prepare' again to finish it"
         )
-    pixel_set = PixelSet(folder, tuple(parse_entries(manifest, folder)))
+    pixel_set = PixelSet(folder, manifest.entries)
     if not pixel_set.entries:
         raise InputError("the pixel set has no entries", path=folder / MANIFEST)
     for entry in pixel_set.entries:
@@ -98,11 +108,11 @@ def open_pixel_set(folder: Path) -> PixelSet:
     return pixel_set
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a set, finished or not. Raises InputError."""
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a set, finished or not. Raises InputError, which names a field that is missing or wrong."""
     path = folder / MANIFEST
     try:
-        manifest: Any = read_json(path)
+        values = read_json(path)
     except OSError as error:
         raise InputError(
             f"not a pixel set: its {MANIFEST} cannot be read ({error.strerror})",
@@ -111,37 +121,19 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         ) from error
     except ValueError as error:
         raise InputError(f"not JSON ({error})", path=path) from error
-    found = manifest.get("format") if isinstance(manifest, dict) else None
+    found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT:
         raise InputError(f"not the manifest of a pixel set: found format {found!r}, expected {FORMAT!r}", path=path)
-    valid: dict[str, Any] = manifest
-    return valid
-
-
-def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
-    """Return the entries of a manifest. Raises InputError if one is incomplete."""
     try:
-        entries = [Entry(**values) for values in manifest["entries"]]
-        problem = next((problem for entry in entries for problem in _problems(entry)), None)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise InputError(f"an entry is incomplete ({error})", path=folder / MANIFEST) from error
-    if problem:
-        raise InputError(problem, path=folder / MANIFEST)
-    return entries
-
-
-def _problems(entry: Any) -> Iterator[str]:
-    # A file without a checksum would not be verified.
-    if not all(isinstance(entry.sha256.get(array), str) for array in ARRAYS):
-        yield "an entry is incomplete (a checksum is missing)"
-    if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
-        yield "a count of an entry is not a whole number above 0"
-    if not isinstance(entry.recipe, dict):
-        yield "the recipe of an entry is not a table"
-    if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
-        yield "the name, scene or source of an entry is not a text"
-    if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
-        yield f"{entry.name!r} is not the name of a folder"
+        manifest = convert(values, Manifest)
+    except ValidationError as error:
+        raise InputError(f"the manifest is damaged ({error})", path=path) from error
+    for entry in manifest.entries:
+        if not set(ARRAYS) <= entry.sha256.keys():  # a file without a checksum would not be verified
+            raise InputError(f"the manifest is damaged (the entry {entry.name!r} lacks a checksum)", path=path)
+        if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
+            raise InputError(f"{entry.name!r} is not the name of a folder", path=path)
+    return manifest
 
 
 def _check_checksums(entry: Entry, folder: Path) -> None:
@@ -204,7 +196,7 @@ class PixelSetWriter:
         self.folder = folder
         self._entries: dict[str, Entry] = {}
         if (folder / MANIFEST).exists():
-            self._entries = {entry.name: entry for entry in parse_entries(read_manifest(folder), folder)}
+            self._entries = {entry.name: entry for entry in read_manifest(folder).entries}
         elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
             raise OutputError("has files in it but is not a pixel set", path=folder, hint="Choose another -o")
         else:
@@ -261,14 +253,9 @@ class PixelSetWriter:
         return self.pixel_set
 
     def _write_manifest(self, *, complete: bool) -> None:
-        manifest = {
-            "format": FORMAT,
-            "version": __version__,
-            "complete": complete,
-            "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
-            "entries": [asdict(entry) for entry in self._entries.values()],
-        }
-        write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+        entries = tuple(self._entries.values())
+        manifest = Manifest(FORMAT, __version__, complete, sum(entry.n_pixels for entry in entries), entries)
+        write_text(self.folder / MANIFEST, json.dumps(to_builtins(manifest), indent=1) + "\n")
 
 
 def _plain(recipe: dict[str, Any]) -> dict[str, Any]:

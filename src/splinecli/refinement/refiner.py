@@ -24,7 +24,7 @@ from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
 from splinecli.system.machine import return_freed_memory, side_by_side
-from splinecli.system.progress import Progress
+from splinecli.system.progress import Progress, ignore
 
 # Pixels around a tile that the nets use as context, a multiple of COARSEST. Two nets reach further (RefineNet's
 # `reach`), but context beyond the margin changes no normal by more than 0.01 degrees. A margin of 64, which is enough
@@ -86,7 +86,7 @@ class NetworkRefiner:
         normals: Floats,
         errors: Floats,
         *,
-        progress: Progress | None = None,
+        progress: Progress = ignore,
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
@@ -99,7 +99,7 @@ class NetworkRefiner:
         of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
         self._refine(_Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole), progress)
 
-    def _refine(self, capture: _Capture, progress: Progress | None = None) -> None:
+    def _refine(self, capture: _Capture, progress: Progress = ignore) -> None:
         half, turns, margin, whole = None, self.turns, self.margin, (capture.normals, capture.errors)
         if len(capture.normals) > self.most_pixels:
             turns = 1
@@ -128,8 +128,7 @@ class NetworkRefiner:
                 # Nothing is known of a pixel that is dark under every light.
                 known = lit[own]
                 band.put(own[known], refined[known], errors[known])
-                if progress is not None:
-                    progress(len(own))
+                progress(len(own))
             # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.
             above.write()
             above = band

@@ -1,19 +1,241 @@
-"""Simulation of whole captures, with a background behind the object and faults common to all pixels."""
+"""Simulation of whole captures, with a background behind the object, a camera, and faults common to all pixels.
+
+Rendered scenes have little pixel-scale curvature. Engraved pieces do, which are plates and half ellipsoids, smooth or
+with detail of a few pixels, but without cast shadows or interreflection.
+
+The camera between the object and the files has a lens, a Bayer pattern, sharpening and JPEG. These effects and
+translucent materials mix neighbouring pixels, so they act on whole images (F, H, W) of linear radiance, background
+included. Each draw documents its distribution. Faults that affect each pixel separately are in batches.py.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import conv2d, max_pool2d, pad
 
+from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.restoration.images import restore_saturated
 from splinecli.restoration.lens_blur import remove_blur, surroundings
 from splinecli.synthesis import batches, draw_number
 from splinecli.synthesis.batches import CaptureConfig, PixelBatch, PixelTruth
-from splinecli.synthesis.engraved import draw_engraved
-from splinecli.synthesis.optics import draw_optics
+from splinecli.synthesis.principled import draw_material, with_one_gloss
+
+
+@dataclass(frozen=True)
+class Optics:
+    """One camera."""
+
+    kernels: Tensor  # (3, k, k), the blur of red, green and blue, each with the sum 1
+    weights: tuple[float, float, float]  # of red, green and blue in the gray value, with the sum 1
+    demosaic: int | None  # OpenCV's code for the Bayer interpolation; None for a sensor without a Bayer pattern
+    sharpening: float  # amount of the unsharp mask, 0 for none
+    sharpening_sigma: float  # its width in pixels
+    jpeg_quality: int | None  # None for no JPEG
+
+    def through_lens(self, images: Tensor) -> Tensor:
+        """Return the red, green and blue irradiance on the sensor (3, F, H, W) for radiance (F, H, W)."""
+        return torch.stack([_blurred(images, kernel) for kernel in self.kernels])
+
+    def develop(self, colours: Tensor) -> Tensor:
+        """Return the gray images (F, H, W), 0 to 1, from the noisy sensor exposure (3, F, H, W), 0 to 1."""
+        if self.demosaic is not None:
+            pattern = colours[1].clone()  # red, green / green, blue
+            pattern[:, ::2, ::2] = colours[0, :, ::2, ::2]
+            pattern[:, 1::2, 1::2] = colours[2, :, 1::2, 1::2]
+            stored = (pattern.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)  # OpenCV interpolates integers
+            found = np.stack([cv2.cvtColor(image, self.demosaic) for image in stored])
+            colours = torch.from_numpy(found.astype(np.float32) / 65535).permute(3, 0, 1, 2)
+        gray = torch.einsum("c,cfhw->fhw", torch.tensor(self.weights), colours)
+        if self.sharpening:
+            soft = _blurred(gray, gaussian_kernel(self.sharpening_sigma))
+            gray = gray + self.sharpening * (gray - soft)
+        return gray.clamp(0, 1)
+
+    def compress(self, images: Tensor) -> Tensor:
+        """Return the linear values of images (F, H, W), 0 to 1, after JPEG compression with the sRGB curve."""
+        if self.jpeg_quality is None:
+            return images
+        encoded = encode_srgb(images.numpy())
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality]
+        files = (cv2.imencode(".jpg", image, quality)[1] for image in encoded)
+        decoded = np.stack([np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE)) for file in files])
+        return torch.from_numpy(decode_transfer(decoded.astype(np.float32) / np.float32(255), None))
+
+
+def draw_optics(generator: torch.Generator) -> Optics:
+    """Draw a camera.
+
+    Blur: none in 15 % of the captures, else with a standard deviation of U(0, 1.2) pixels, a Gaussian or, in a third,
+    the disc of defocus. The widths of red, green and blue differ by U(-8, 8) % each. Bayer pattern: in half of
+    the captures, of which half are interpolated bilinearly, the others along edges. Object colour and gray weights,
+    combined: U(0.2, 1) for each of red, green and blue. Sharpening: in 20 %, an unsharp mask of U(0.2, 1) with a sigma
+    of U(0.6, 1.5) pixels. JPEG, for 8-bit captures: in a third, with a quality of U(75, 98).
+    """
+    uniform = partial(draw_number, generator)
+    sigma = uniform(0, 1.2) * (uniform() >= 0.15)
+    kernel = disc_kernel if uniform() < 1 / 3 else gaussian_kernel
+    kernels = [kernel(sigma * uniform(0.92, 1.08)) for _ in range(3)]
+    widest = max(len(each) for each in kernels)
+    kernels = [pad(each, ((widest - len(each)) // 2,) * 4) for each in kernels]
+    red, green, blue = (uniform(0.2, 1) for _ in range(3))
+    total = red + green + blue
+    bayer = uniform()
+    return Optics(
+        kernels=torch.stack(kernels),
+        weights=(red / total, green / total, blue / total),
+        demosaic=(cv2.COLOR_BayerRGGB2RGB if bayer < 0.25 else cv2.COLOR_BayerRGGB2RGB_EA) if bayer < 0.5 else None,
+        sharpening=uniform(0.2, 1) * (uniform() < 0.2),
+        sharpening_sigma=uniform(0.6, 1.5),
+        jpeg_quality=round(uniform(75, 98)) if uniform() < 1 / 3 else None,
+    )
+
+
+def gaussian_kernel(sigma: float) -> Tensor:
+    """Return a Gaussian (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either axis."""
+    reach = math.ceil(3 * sigma)
+    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / max(sigma, 1e-3)) ** 2)
+    kernel = weights[:, None] * weights
+    return kernel / kernel.sum()
+
+
+def disc_kernel(sigma: float) -> Tensor:
+    """Return a disc (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either axis."""
+    radius, finer = 2 * sigma, 5  # samples per pixel and axis
+    reach = math.ceil(radius)
+    places = (torch.arange((2 * reach + 1) * finer) + 0.5) / finer - 0.5 - reach
+    inside = (places[:, None] ** 2 + places**2 <= max(radius, 0.2) ** 2).float()
+    kernel = torch.nn.functional.avg_pool2d(inside[None, None], finer)[0, 0]
+    return kernel / kernel.sum()
+
+
+def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
+    """Return radiance (F, H, W) of an object (H, W) whose material scatters light below its surface.
+
+    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry: a Gaussian with a sigma of
+    U(1, 4) pixels. Light does not scatter out of the object.
+    """
+    share, kernel = draw_number(generator, 0.3, 1), gaussian_kernel(draw_number(generator, 1, 4))
+    inside = mask[None].float()
+    spread = _blurred(maps * inside, kernel) / _blurred(inside, kernel).clamp(min=1e-3)
+    return torch.lerp(maps, spread, share) * inside
+
+
+def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
+    """Return images (F, H, W), convolved with a kernel (k, k); the border values are extended outwards."""
+    if len(kernel) == 1:
+        return images
+    reach = len(kernel) // 2
+    around = pad(images[:, None], (reach,) * 4, mode="replicate")
+    return conv2d(around, kernel[None, None].to(images))[:, 0]
+
+
+def draw_engraved(
+    size: int, lights: Tensor, generator: torch.Generator, *, round_share: float = 1 / 3
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size) with P true pixels.
+
+    `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the
+    frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has
+    one kind of detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or curved; facets of 3 to
+    20 pixels; or a random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6),
+    a third as large for the texture. A third of the pieces are smooth. The material comes from draw_material, with 1 to
+    300 patches; in half of the pieces, the patches differ only in their base colour. The lights (F, 3) are unit.
+    """
+    uniform = partial(draw_number, generator)
+    normals, mask = _draw_base(size, round_share, generator)
+    # A third of the pieces have no detail, because smooth surfaces must stay smooth whatever their material.
+    if uniform() >= 1 / 3:
+        detail = _draw_detail(size, generator)
+        normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
+        normals = torch.nn.functional.normalize(normals, dim=1)
+    patches = int(300 ** uniform())
+    material = draw_material(patches, generator)
+    if uniform() < 0.5:
+        material = with_one_gloss(material)
+    material = material.take(_cells(patches, size, generator)[mask])
+    normals = normals[mask]
+    cosines = (normals @ lights.T).clamp(min=0)
+    return normals, material.shade(cosines, normals[:, 2:], lights[:, 2]), mask.view(size, size)
+
+
+def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw a half ellipsoid or a plate; return its unit normals (size^2, 3) and its mask (size^2,)."""
+    uniform = partial(draw_number, generator)
+    places = _places(size)
+    if uniform() < round_share:
+        direction = _draw_direction(generator)
+        across = torch.stack((direction, torch.tensor((-direction[1], direction[0]))))
+        middle = places - places.mean(dim=0)
+        axes = torch.tensor((uniform(0.3, 0.49), uniform(0.3, 0.49))) * size
+        at = middle @ across.T / axes
+        radius = at.square().sum(1)
+        height = (1 - radius).clamp(min=0).sqrt()[:, None]
+        base = torch.cat((uniform(0.3, 1.5) * (at / axes * axes.mean()) @ across, height), dim=1)
+        return torch.nn.functional.normalize(base, dim=1), radius < 1
+    slopes = uniform(0, 0.7) * _draw_direction(generator).expand(size * size, 2)
+    for _ in range(3):
+        direction = _draw_direction(generator)
+        wave = (2 * math.pi * (places @ direction / (uniform(0.3, 2) * size) + uniform())).sin()
+        slopes = slopes + uniform(0, 0.3) * wave[:, None] * direction
+    base = torch.cat((-slopes, torch.ones(size * size, 1)), dim=1)
+    return torch.nn.functional.normalize(base, dim=1), torch.ones(size * size, dtype=torch.bool)
+
+
+def _draw_detail(size: int, generator: torch.Generator) -> Tensor:
+    """Draw the slopes (size^2, 2) of grooves, facets or a texture."""
+    uniform = partial(draw_number, generator)
+    steepness = uniform(0.05, 0.6)
+    kind = int(3 * uniform())
+    if kind == 0:
+        direction = _draw_direction(generator)
+        bend = _smooth(torch.randn(1, size, size, generator=generator), 12).view(-1)
+        place = _places(size) @ direction + (uniform() < 0.5) * uniform(0, 12) * bend / bend.std()
+        number = (place / uniform(1, 6) + uniform(0, 2)).floor().long()
+        number = number - number.min()
+        side = 2.0 * (number % 2) - 1
+        if uniform() < 0.5:
+            side = torch.randn(int(number.max()) + 1, generator=generator)[number]
+        return steepness * side[:, None] * direction
+    if kind == 1:
+        count = int((size / uniform(3, 20)) ** 2) + 1
+        return (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
+    grain = _smooth(torch.randn(2, size, size, generator=generator), uniform(0.4, 1.5))
+    return steepness / 3 * (grain / grain.std()).view(2, -1).T
+
+
+def _places(size: int) -> Tensor:
+    """Return the positions (size^2, 2) of the pixels, y up."""
+    rows, columns = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    return torch.stack((columns, -rows), dim=-1).view(-1, 2)
+
+
+def _draw_direction(generator: torch.Generator) -> Tensor:
+    """Draw a unit vector (2,)."""
+    angle = draw_number(generator, 0, 2 * math.pi)
+    return torch.tensor((math.cos(angle), math.sin(angle)))
+
+
+def _cells(count: int, size: int, generator: torch.Generator) -> Tensor:
+    """Return the Voronoi cell (P,) of each pixel, 0 to count - 1, around random points."""
+    from scipy.spatial import cKDTree
+
+    points = size * torch.rand(count, 2, generator=generator).numpy()
+    places = np.indices((size, size)).reshape(2, -1).T
+    return torch.from_numpy(cKDTree(points).query(places)[1])
+
+
+def _smooth(maps: Tensor, sigma: float) -> Tensor:
+    from scipy.ndimage import gaussian_filter
+
+    return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma, sigma), mode="wrap"))
 
 
 def photograph_captures(

@@ -5,6 +5,7 @@ import filecmp
 import hashlib
 import itertools
 import json
+import math
 import os
 import secrets
 import stat
@@ -12,7 +13,9 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
+
+from msgspec import ValidationError, convert
 
 from splinecli.errors import InputError, OutputError
 
@@ -131,18 +134,33 @@ def sync_names(folder: Path, *made: Path) -> None:
         sync(place)
 
 
-def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text. Raises ValueError, also if it is nested deeply or no float can hold a number."""
+Value = TypeVar("Value")
+
+
+def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
+    """Return the value of a JSON text, such as a record of this kind.
+
+    Raises ValueError, also if it is nested deeply, a number is not finite or no float can hold it, or the value does
+    not fit the kind, with its place.
+    """
 
     def whole_number(digits: str) -> int:
         if len(digits) > 300:  # a float holds any of so many
             raise ValueError(f"a number has {len(digits)} digits")
         return int(digits)
 
+    def finite_number(digits: str) -> float:
+        if not math.isfinite(number := float(digits)):
+            raise ValueError(f"the number {digits[:40]} is not finite")
+        return number
+
     try:
-        return json.loads(text, parse_int=whole_number)
+        read = json.loads(text, parse_int=whole_number, parse_float=finite_number, parse_constant=finite_number)
+        return convert(read, kind)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+    except ValidationError as error:
+        raise ValueError(str(error)) from None
 
 
 def is_special(path: Path) -> bool:
@@ -150,13 +168,13 @@ def is_special(path: Path) -> bool:
     return path.exists() and not path.is_file()
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, kind: type[Value] | Any = Any) -> Value | Any:
     """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it is not a file."""
     if is_special(path):
         raise ValueError("it is not a file")
     if path.stat().st_size > _MOST_JSON:
         raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
-    return parse_json(path.read_text("utf-8"))
+    return parse_json(path.read_text("utf-8"), kind)
 
 
 class NoRoomError(OutputError):

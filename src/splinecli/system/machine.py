@@ -274,28 +274,36 @@ def one_thread_each() -> Iterator[int]:
             torch.set_num_threads(threads)
 
 
-def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
-    """Yield function(part) of each part, in order, computed without gradients on as many threads as PyTorch uses.
+def in_order(
+    function: Callable[[Part], Result],
+    parts: Iterable[Part],
+    threads: int = 1,
+    start: Callable[[], object] | None = None,
+) -> Iterator[Result]:
+    """Yield function(part) of each part, in order, computed on so many threads, each of which calls `start` first.
 
-    Within the function, each operation of PyTorch uses one thread. At most one result more than there are threads is
-    kept. An error is raised when its part is due.
+    At most one result more than there are threads is kept. An error is raised when its part is due.
+    """
+    waiting: deque[Future[Result]] = deque()
+    pool = ThreadPoolExecutor(threads, "part", start)
+    try:
+        for part in parts:
+            waiting.append(pool.submit(function, part))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
+    """Yield function(part) of each part as in_order does, without gradients, on as many threads as PyTorch uses.
+
+    Within the function, each operation of PyTorch uses one thread.
     """
     import torch
 
-    def compute(part: Part) -> Result:
-        with torch.inference_mode():
-            return function(part)
-
-    waiting: deque[Future[Result]] = deque()
     with one_thread_each() as threads:
         # Each new thread has the number of threads of OpenMP, until PyTorch sets its own.
-        pool = ThreadPoolExecutor(threads, "part", lambda: torch.set_num_threads(1))
-        try:
-            for part in parts:
-                waiting.append(pool.submit(compute, part))
-                if len(waiting) > threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        yield from in_order(torch.inference_mode()(function), parts, threads, lambda: torch.set_num_threads(1))

@@ -6,6 +6,12 @@ from contextlib import contextmanager
 from typing import Protocol
 
 Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
+
+
+def ignore(*_: object, **__: object) -> None:
+    """Show no progress."""
+
+
 # The stages in order, except for page.html, which is one of the pictures but is written after the surface
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
 
@@ -89,7 +95,7 @@ class Observer:
 
         `unit` is the name of a step, such as pixels, if the number per second is informative.
         """
-        yield lambda amount, note="": None
+        yield ignore
 
 
 SILENT = Observer()

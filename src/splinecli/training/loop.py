@@ -1,33 +1,134 @@
 """The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run.
 
-A run starts or continues in a folder, with one process or with all processes of torchrun.
+A run starts or continues in a folder, with one process or with all processes of torchrun. After each backward pass the
+processes average their gradients in one message, with gloo on CPUs and NCCL on GPUs. Every process then computes the
+same update of the same weights. The only other data exchanged is the training time of the first process.
 """
 
 import copy
 import json
 import math
+import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
-from splinecli.errors import ModelError, OutputError
+from splinecli.errors import ModelError, OutputError, UsageError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis import stream_seed
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
+from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
 from splinecli.training import run_files
 from splinecli.training.config import Settings, TrainingConfig, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
-from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_files import Metrics, RunCounters, RunLog
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The rank of this process among `count` processes. Rank 0 leads: only it writes files and keeps the time."""
+
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process is the leader."""
+        return self.rank == 0
+
+    def shards(self, total: int) -> range:
+        """Return the shards of a batch for this process. Raises UsageError if they cannot be shared evenly."""
+        if total % self.count:
+            raise UsageError(
+                f"{self.count} processes cannot share the {total} shards of a batch evenly",
+                hint=f"Add --param shards={self.count}, or start a number of processes that divides {total}",
+            )
+        return range(self.rank, total, self.count)
+
+    def average(self, parameters: Iterable[nn.Parameter], numbers: Tensor) -> Tensor:
+        """Average the gradients over all processes, in place, and return the average of `numbers` (N,)."""
+        if self.count == 1:
+            return numbers
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        message = torch.cat([*(gradient.flatten() for gradient in gradients), numbers.to(gradients[0])])
+        with _lost_peers_as_model_errors():
+            dist.all_reduce(message)
+        message /= self.count
+        sizes = [*(gradient.numel() for gradient in gradients), len(numbers)]
+        *averaged, numbers_averaged = torch.split(message, sizes)
+        for gradient, mean in zip(gradients, averaged, strict=True):
+            gradient.copy_(mean.view_as(gradient))
+        return numbers_averaged.to(numbers)
+
+    def agree(self, value: float, device: torch.device) -> float:
+        """Return the value of the first process, for all processes."""
+        if self.count == 1:
+            return value
+        shared = torch.tensor([value], dtype=torch.float64, device=device)
+        with _lost_peers_as_model_errors():
+            dist.broadcast(shared, src=0)
+        return float(shared.item())
+
+
+@contextmanager
+def _lost_peers_as_model_errors() -> Iterator[None]:
+    """Raise ModelError if another process can no longer be reached."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason = (str(error).splitlines() or ["no reason given"])[0][:200]
+        raise ModelError(
+            f"another process of the run stopped ({reason})",
+            hint="See its own message for the reason. --resume continues the run",
+        ) from error
+
+
+def restarts_are_allowed() -> bool:
+    """Return whether torchrun restarts the processes when one fails. They then continue the run.
+
+    There is no way to know whether this has just happened: torchrun does not report failures on other machines.
+    """
+    return int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0
+
+
+def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
+    """Join the other processes, if torchrun started any; return the rank of this process and its device."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ and int(os.environ.get("WORLD_SIZE", "1")) <= 1:
+        return Workers(), device
+    if device.type == "cuda":
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(device)
+    if not dist.is_initialized():
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+        if attempt and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
+            # torchrun keeps its store after a restart, with the addresses of processes that have ended. Prefixing the
+            # keys with the attempt number hides these. All processes agree on the number only on a single machine.
+            store, rank, count = next(rendezvous("env://"))
+            store = PrefixStore(f"splinecli attempt {attempt}", store)
+            dist.init_process_group(backend, store=store, rank=rank, world_size=count)
+        else:
+            dist.init_process_group(backend)
+    return Workers(dist.get_rank(), dist.get_world_size()), device
+
+
+def leave_workers() -> None:
+    """Leave the process group, if this process joined one."""
+    if dist.is_available() and dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -73,7 +174,7 @@ class Trainer:
         resume: bool = False,
         workers: Workers | None = None,
         tensorboard: bool = False,
-        say: Callable[[str], object] = lambda sentence: None,
+        observer: Observer = SILENT,
     ) -> None:
         """Start a run, or resume one; see open_run. Raises ModelError, OutputError, InputError, UsageError."""
         self.config = config
@@ -106,7 +207,7 @@ class Trainer:
             state = self.network, self.average, self.optimizer
             self.counters = run_files.load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
         if self.workers.leads and self.task.long_start:
-            say(self.task.long_start)
+            observer.say(self.task.long_start)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
@@ -243,12 +344,11 @@ def open_run(
     *,
     resume: bool,
     tensorboard: bool,
-    warn: Callable[[str], object],
-    say: Callable[[str], object],
+    observer: Observer,
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
 
-    `warn` receives a message about files left by a killed process, `say` a message about a slow start.
+    The observer receives messages about files left by a killed process and about a slow start.
 
     Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
     installed; ModelError if the checkpoint does not fit, or the initial weights cannot be used; InputError if a pixel
@@ -261,5 +361,7 @@ def open_run(
         stack.callback(leave_workers)
         workers.shards(config.shards)  # raises UsageError before the folder is made
         if workers.leads:
-            stack.enter_context(held_folder(folder, warn))
-        yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard, say=say)
+            stack.enter_context(held_folder(folder, observer.warn))
+        yield Trainer(
+            config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard, observer=observer
+        )

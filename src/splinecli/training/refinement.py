@@ -24,10 +24,8 @@ from splinecli.refinement.features import Turn, brightness, refine_features, tur
 from splinecli.restoration.lens_blur import REACH
 from splinecli.synthesis import stream_seed
 from splinecli.synthesis.batches import CaptureConfig
-from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
-from splinecli.synthesis.optics import scatter
-from splinecli.synthesis.whole_capture import add_background, photograph_scene
+from splinecli.synthesis.whole_capture import add_background, draw_engraved, photograph_scene, scatter
 from splinecli.training.objective import angles, balanced
 
 # Captures simulated before the first step. With 64, the net memorised them and was worse on others for half an hour.

@@ -8,11 +8,12 @@ its newest captures again and continues without the earlier ones.
 import csv
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import torch
+from msgspec import Struct, to_builtins
 from torch import Tensor
 
 from splinecli.errors import ModelError, OutputError
@@ -160,8 +161,7 @@ def _lines_until(step: int, path: Path) -> list[str]:
 FORMAT = "splinecli-checkpoint-2"
 
 
-@dataclass
-class RunCounters:
+class RunCounters(Struct, forbid_unknown_fields=True):
     """Steps, training pixels and seconds of training so far."""
 
     step: int = 0
@@ -192,7 +192,7 @@ def save_checkpoint(
     metadata = {
         "format": FORMAT,
         "config": json.dumps(config.to_dict()),
-        "clock": json.dumps(asdict(counters)),
+        "clock": json.dumps(to_builtins(counters)),
         "sets": json.dumps(sets),
         "tensors_sha256": tensors_sha256(plain),
     }
@@ -213,7 +213,7 @@ def load_checkpoint(
     Raises ModelError if the file is missing, damaged or from another network, or a pixel set has changed.
     """
     tensors, metadata = _read(path)
-    for name, sha256 in read_json_entry(metadata, "sets", path).items():
+    for name, sha256 in read_json_entry(metadata, "sets", path, dict[str, str]).items():
         if sets.get(name) != sha256:
             raise ModelError(
                 f"the pixel set {name} has changed since the run was started",
@@ -228,10 +228,10 @@ def load_checkpoint(
             index, _, key = name.partition(".")
             states.setdefault(int(index), {})[key] = tensor
         optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-        counters = RunCounters(**read_json_entry(metadata, "clock", path))
-        return RunCounters(int(counters.step), int(counters.pixels), float(counters.seconds))
     except (TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
+    counters: RunCounters = read_json_entry(metadata, "clock", path, RunCounters)
+    return counters
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

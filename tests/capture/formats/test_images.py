@@ -1,4 +1,7 @@
-"""Photographs and masks: values exactly as written, and damaged files refused without a word on stderr."""
+"""Photographs and masks: values exactly as written, and damaged files refused without a word on stderr.
+
+BMP, TGA and EXIF tags (exposures and orientations, one of each for all images) are written by Pillow.
+"""
 
 import struct
 import zlib
@@ -8,10 +11,15 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image, ImageFile
+from PIL.TiffImagePlugin import IFDRational
 
 from capture.conftest import WriteImage
-from scenes import with_chunk
-from splinecli.capture import read_image, read_mask
+from scenes import ring_lights, with_chunk, write_capture
+from splinecli import capture_warnings
+from splinecli.capture import open_capture, read_capture, read_image, read_mask
+from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_header
+from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
 
 RNG = np.random.default_rng(2)
@@ -164,3 +172,128 @@ def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path: Path, name: str, col
     for nothing in (np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]):
         cv2.imwrite(str(tmp_path / name), np.dstack([CUT_OUT] * 3 + [np.asarray(nothing, np.uint8)]))
         np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+
+
+RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
+
+
+@pytest.mark.parametrize(("suffix", "options"), [(".bmp", {}), (".tga", {}), (".tga", {"compression": "tga_rle"})])
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("L", 1), ("P", 3)])
+def test_pixels(tmp_path: Path, suffix: str, options: dict[str, str], mode: str, channels: int) -> None:
+    picture = Image.fromarray(RGB).convert(mode)
+    picture.save(tmp_path / f"image{suffix}", **options)
+    path = tmp_path / f"image{suffix}"
+    expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
+    np.testing.assert_array_equal(decode_image(path), expected)
+    facts = read_header(path)
+    assert facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tga"])
+def test_damage(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(RGB).save(path)
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:10], b"BM" + bytes(40)):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"damaged|found an image|empty"):
+            decode_image(path)
+
+
+def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
+    pictures, lights = np.full((6, 4, 5), 100, np.uint8), ring_lights(6)
+    folder = write_capture(tmp_path / "owl", pictures, lights, names="owl.{}.png")
+    Image.fromarray(RGB).save(folder / "owl.mask.bmp")
+    Image.fromarray(RGB).save(folder / "owl_normal.tga")
+    capture = read_capture(folder)
+    assert capture.n_lights == 6
+    (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
+    assert str(found).startswith("owl.mask.bmp and 1 more: left out")
+    # If all of them have such names, these say nothing.
+    assert read_capture(write_capture(tmp_path / "a", pictures, lights, names="mask_of_a_king_{}.png")).n_lights == 6
+
+
+def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -> None:
+    folder = write_capture(tmp_path / "owl", np.full((6, 4, 5), 100, np.uint8), ring_lights(6))
+    Image.fromarray(RGB[:2]).save(folder / "thumb.png")
+    capture = read_capture(folder)
+    assert (capture.n_lights, capture.mask.shape) == (6, (4, 5))
+    (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
+    assert str(found).startswith("thumb.png: left out, because light_directions.txt has no light for it")
+    Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "006.png")
+    with pytest.raises(InputError, match="found 6 light directions, expected 8"):
+        read_capture(folder)
+
+
+EXIF = 0x8769
+
+
+def write(path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100) -> Path:
+    image = Image.fromarray(np.full((6, 8, 3), 90, np.uint8))
+    tags = Image.Exif()
+    tags[0x010F] = "Maker"  # without any tag of its own Pillow leaves all out
+    if seconds is not None:
+        tags.get_ifd(EXIF).update({0x829A: IFDRational(*seconds), 0x829D: f_number, 0x8827: iso})
+    image.save(path, exif=tags)
+    return path
+
+
+def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
+    folder.mkdir(exist_ok=True)
+    for number, seconds in enumerate(exposures):
+        write(folder / f"{number}.jpg", seconds)
+    (folder / "lights.txt").write_text("0 0 1\n0.5 0 1\n0 0.5 1\n")
+    return folder
+
+
+def test_reading(tmp_path: Path) -> None:
+    for suffix in ("jpg", "png"):
+        assert find_exposure(read_header(write(tmp_path / f"a.{suffix}"))) == Exposure(1 / 60, 8.0, 100)
+        assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
+
+
+def test_mixed_exposures_are_divided_out(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
+    for options in ({}, {"intensities": "equal"}):  # equal lamps do not make equal exposures
+        source = open_capture(folder, **options)
+        # The third image got twice the light of the others; the mean is 4 / 3.
+        np.testing.assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
+        assert (source.intensities_known, source.intensities_measured) == (bool(options), False)
+        assert source.warnings[0].code == "exif_exposure"
+        assert "from 1/60 s, f/8, ISO 100 to 1/30 s, f/8, ISO 100." in str(source.warnings[0])
+    write(folder / "1.jpg", None)
+    message = r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s, f/8, ISO 100 as in 0\.jpg"
+    with pytest.raises(InputError, match=message):
+        open_capture(folder)
+    # Intensities say how the images compare.
+    (folder / "light_intensities.txt").write_text("1\n1\n2\n")
+    assert open_capture(folder).n_lights == 3
+
+
+def test_exposures_that_are_one(tmp_path: Path) -> None:
+    open_capture(capture(tmp_path / "rounded", (1, 60), (10, 610), None))
+    folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))
+    write(folder / "1.jpg", (1, 120), iso=200)
+    open_capture(folder)
+
+
+def turned(folder: Path, name: str, orientation: int | None) -> Path:
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    Image.new("L", (4, 3), 90).save(folder / name, exif=exif)
+    return folder / name
+
+
+@pytest.mark.parametrize(("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)])
+def test_one_orientation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: int | None, expected: int) -> None:
+    """The pixels are not decoded, which takes seconds for 24 megapixels."""
+    images = [turned(tmp_path, "a.jpg", tag), turned(tmp_path, "b.tif", tag), turned(tmp_path, "c.png", tag)]
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    assert common_orientation([read_header(image) for image in images]) == expected
+
+
+def test_different_orientations_are_refused(tmp_path: Path) -> None:
+    images = [turned(tmp_path, "a.jpg", None), turned(tmp_path, "b.jpg", 1), turned(tmp_path, "c.jpg", 8)]
+    with pytest.raises(InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"):
+        common_orientation([read_header(image) for image in images])
