@@ -72,7 +72,7 @@ class OutputMap:
             raise InputError(
                 f"{count} lights do not determine the {self.name}, expected at least {self.fewest_lights}",
                 path=path,
-                hint=f"Use more lights, or leave {self.name} out of --maps",
+                hint=f"Use more lights, or leave {self.name} out",
             )
 
 
