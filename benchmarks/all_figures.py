@@ -114,6 +114,18 @@ class Bench:
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
 
+    def relighting(self, label: str) -> Cells:
+        """Compare renderings under the lights that a draw of ten leaves out with the photographs, in decibels."""
+        from splinecli.pipeline.evaluate import evaluate_captures
+        from splinecli.pipeline.options import EvaluateOptions
+
+        output = str(self.results / "relighting" / label)
+        options = EvaluateOptions(
+            datasets=(self.objects[label],), n_lights=(10,), trials=1, max_pixels=2000, relight=True, output=output
+        )
+        [found] = evaluate_captures(options).document["relighting"]
+        return {kind: found[kind]["psnr_db"] for kind in tables.PICTURES.values()}
+
     def slants(self, label: str) -> Cells:
         """Mean errors of the pixels of each range of true slants, under ten lights."""
         cells: Cells = {}
@@ -259,6 +271,7 @@ class Bench:
             "photographs": {name: partial(self.photographs, name) for name in captures},
             "confidence": {name: partial(self.confidence, name) for name in captures},
             "refined-lights": {m: partial(self.refined_lights, m) for m in ("iw12", *NETWORKS)},
+            "relighting": {label: partial(self.relighting, label) for label in OBJECTS},
             "distilled": {label: partial(self.distilled, label) for label in OBJECTS},
             "wrong-lights": each(self.wrong_lights, tables.WRONG_FILES),
             "near-lamps": each(self.near_lamps, tables.SCENES),

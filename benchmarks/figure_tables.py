@@ -50,6 +50,7 @@ WRONG_FILES = (
 LIGHT_FILE_CAPTURES = ("photographs", "diffuse, specular", "metal")
 EXPOSED = ("well exposed", "as stored", "left out", "restored")
 INTENSITIES = ("measured", "equal", "estimated")
+PICTURES = {"material": "material", "Lambertian": "lambertian", "nearest photograph": "nearest"}
 SPEEDS = ("layers of the paper, float32", "spline-net-pixelwise, float32", "spline-net-pixelwise, bfloat16")
 SIZES = ("0.5", "2", "6", "24")
 
@@ -189,6 +190,7 @@ TABLES = {
         same(("distant", *(f"{width}: {how}" for width in (2, 4, 8) for how in ("no", "yes")))),
     ),
     "calibration": Table(("calibration",), "ball", same(MIRROR_BALLS), same(("mean", "largest")), "{:.1f}"),
+    "relighting": Table(("relighting",), "object", same(OBJECTS), PICTURES, "{:.1f}"),
     "distilled": Table(("distilled",), "object", same(OBJECTS), same(("network", "distilled"))),
     "speed": Table(("speed",), "network", same(SPEEDS), same(("pixels/s", "relative")), "{:,.0f}"),
     "sizes": Table(

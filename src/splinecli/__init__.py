@@ -156,14 +156,16 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
 
     Args:
         estimate: the result of estimate_normals.
-        colours: (F, H, W, 3) linear RGB, the images divided by the light intensities. None gives a gray base colour.
+        colours: (F, H, W, 3) linear RGB, the images divided by the light intensities. None, for gray images, gives a
+            gray base colour.
 
     Returns:
         A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and roughness, metalness,
-        specular and confidence (P,).
+        specular and confidence (P,). `is_gray` tells whether the base colour is only brightness.
 
     Raises:
-        splinecli.errors.InputError: there are fewer than four lights.
+        splinecli.errors.InputError: there are fewer than four lights, or a colour is not finite.
+        splinecli.errors.UsageError: the colours have another shape.
 
     Examples:
         An orange matte plane under four lights:
@@ -179,12 +181,19 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
     """
     import numpy as np
 
+    from splinecli.errors import InputError, UsageError
     from splinecli.results.material import material_of
 
     capture = estimate.capture
     if colours is None:
         return material_of(estimate)
-    images = (np.asarray(image, np.float32)[capture.mask] for image in np.asarray(colours))
+    stack, expected = np.asarray(colours), (capture.n_lights, *capture.mask.shape, 3)
+    if stack.shape != expected or stack.dtype.kind not in "uif":
+        problem = f"found colours of shape {stack.shape} and type {stack.dtype}, expected numbers of shape {expected}"
+        raise UsageError(problem, hint="Leave colours out for gray images")
+    if not np.isfinite(stack[:, capture.mask]).all():
+        raise InputError("some colours are not finite", hint="Leave their pixels out of the mask")
+    images = (image[capture.mask].astype(np.float32) for image in stack)
     means = capture.observations.T
     # The observations may have another scale, and restored values.
     scaled = (

@@ -72,7 +72,7 @@ class OutputMap:
             raise InputError(
                 f"--maps {self.name} needs at least {self.fewest_lights} lights, found {count}",
                 path=path,
-                hint=f"Use more lights, or leave {self.name} out of --maps",
+                hint=f"Use more lights, or leave {self.name} out",
             )
 
 

@@ -13,7 +13,7 @@ from glb_file import read_glb
 from scenes import cap_directions, sphere, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.figures import likeness
 from splinecli.inference import estimate_normals
 from splinecli.lights.lighting import PixelLighting
@@ -210,6 +210,23 @@ def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
     assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
     stored = cv2.imread(str(folder / "metallic_roughness.png"))[..., ::-1]
     np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
+
+
+def test_coloured_lamps_do_not_tint_gray_images(glossy, tmp_path):
+    np.savetxt(glossy / "light_intensities.txt", np.tile((1.2, 1, 0.8), (len(LIGHTS), 1)))
+    report = infer_capture(glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out")))
+    assert "gray_material" in [warning["code"] for warning in report["warnings"]]
+
+
+def test_colours_of_another_shape_are_refused(glossy):
+    estimate = estimate_normals(open_capture(glossy).read(), make_estimator("ls"))
+    colours = np.full((len(LIGHTS), SIZE, SIZE, 3), np.float32(0.5))
+    for wrong in (colours[..., 0], colours[1:], colours[:, 1:], "images"):
+        with pytest.raises(UsageError, match=r"expected numbers of shape \(12, 48, 48, 3\)"):
+            estimate_material(estimate, wrong)
+    colours[0, SIZE // 2, SIZE // 2] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        estimate_material(estimate, colours)
 
 
 def test_three_lights_are_refused(glossy, tmp_path):

@@ -268,7 +268,7 @@ def test_a_prior_in_another_direction_or_unit() -> None:
     for factor in (-1.0, 20.0, 0.01):
         with pytest.raises(InputError, match="the prior is") as raised:
             integrate_normals(normals, prior=factor * heights)
-        stated = re.search(r"are (\S+) times", str(raised.value))
+        stated = re.search(r"is (\S+) times", str(raised.value))
         assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
 
 

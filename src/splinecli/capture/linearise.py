@@ -248,7 +248,9 @@ class StoredPixels:
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
     def colours(self) -> Float32Array:
-        """Return linear RGB (P, 3), each channel divided by its intensity."""
+        """Return linear RGB (P, 3), each channel divided by its intensity; lamps do not tint gray images."""
+        if self.linear.shape[1] == 1:
+            return np.repeat(self.observe()[:, None], 3, axis=1)
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
         colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
         colours /= self.intensity.astype(np.float32)
