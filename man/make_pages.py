@@ -70,7 +70,7 @@ EXAMPLES = {
     "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html": "Also write albedo, preview, mesh and"
     " page.",
     "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
-    "splinecli info obj/": "Show what infer would read.",
+    "splinecli info obj/": "Describe the capture as infer would read it.",
     "splinecli info obj/ --transfer srgb --plot lights.png": "Check sRGB images, and plot the light directions.",
     "splinecli calibrate chrome/ -o lights": "Measure light directions with a mirror ball.",
     "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights": "Give the outline of the ball, and"

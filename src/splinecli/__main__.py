@@ -8,7 +8,7 @@ from splinecli.cli.signals import DEFERRED, INTERRUPTED, end_on_signals, ignore_
 
 
 def run() -> None:
-    """Run the command of the arguments and exit. SIGTERM is treated like Ctrl-C."""
+    """Run the command that the arguments specify, and exit. SIGTERM is treated like Ctrl-C."""
     try:
         end_on_signals()
         # NumPy's products are small here, and on a busy machine several times as fast on one core. It reads this once.

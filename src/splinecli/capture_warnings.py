@@ -1,7 +1,7 @@
 """The warnings of a capture: one row of the table for each kind, with a stable code for programs.
 
 A check or a reader creates a warning from its row, with a human-readable sentence. The rows also generate the table in
-docs/troubleshooting.md (docs/make_tables.py), and determine the warnings that `--strict` turns into errors.
+docs/warnings.md (docs/make_tables.py), and determine the warnings that `--strict` turns into errors.
 """
 
 from dataclasses import dataclass
@@ -55,15 +55,16 @@ class CaptureWarning:
 
 # The rows form a table: code, meaning, remedy, severity.
 # fmt: off
-AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` of the folder was subtracted")
+AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` in the folder was subtracted")
 BLACK_PIXELS = WarningKind("black_pixels", "Over 1 % of the pixels are black under every light",
-    "Use a mask, or expose longer")
+    "Use a mask, or a longer exposure")
 CONSTANT_LIGHT = WarningKind("constant_light",
     "The images look as if they contained [ambient light](input-checks.md#other-interpretations-of-the-images) or a "
     "black level", "`--ambient IMAGE`, taken with all lamps off", severity="error")
-DARK_IMAGES = WarningKind("dark_images", "Images use little of the range", "Expose longer")
+DARK_IMAGES = WarningKind("dark_images", "The images use a small part of the range", "Use a longer exposure")
 DIFFERENT_SIZES = WarningKind("different_sizes", "The images have different sizes", "Export them in one size")
-DISPLAY_DECODED = WarningKind("display_decoded", "The images state a curve, as JPEG does, and are read with it",
+DISPLAY_DECODED = WarningKind("display_decoded",
+    "The image files specify a transfer curve, as JPEG files do, and are read with it",
     "`--transfer linear` if they are linear")
 DISPLAY_ENCODED = WarningKind("display_encoded", "Some images are JPEG or sRGB files, but are read as linear",
     "`--transfer srgb`; none if they are linear")
@@ -86,7 +87,7 @@ EXIF_ORIENTATION = WarningKind("exif_orientation",
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
 GRAY_MATERIAL = WarningKind("gray_material", "With `--maps material`: gray images have no base colour, only brightness")
 GROUND_TRUTH_FRAME = WarningKind("ground_truth_frame",
-    "The ground truth fits the images only with x or y negated, or exchanged",
+    "The ground truth fits the images only if x or y is negated, or x and y are exchanged",
     "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`", severity="error")
 GROUND_TRUTH_SHIFTED = WarningKind("ground_truth_shifted", "The ground truth fits the images only after a shift",
     "Align it with the images", severity="error")
@@ -97,12 +98,13 @@ IMAGE_INCONSISTENT = WarningKind("image_inconsistent",
     "One image [contradicts the others](input-checks.md#one-odd-image)",
     "Photograph it again, or leave it out with `--light-indices`", severity="error")
 IMAGE_SCALE = WarningKind("image_scale",
-    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with 12 bits among 16",
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit image among "
+    "16-bit ones",
     "Save all images with the same bit depth", severity="error")
 IMAGES_ALIGNED = WarningKind("images_aligned",
     "The images were [aligned](image-preparation.md#moved-images), as `--align` requests")
 IMAGES_LEFT_OUT = WarningKind("images_left_out",
-    "The light file does not name all images, or pictures have names of masks or maps, or another size",
+    "The light file does not name all images, or some pictures have the name of a mask or map, or another size",
     "Check names and sizes")
 IMAGES_SHIFTED = WarningKind("images_shifted",
     "Images are [shifted against the others](input-checks.md#shifted-images)",
@@ -115,7 +117,7 @@ LIGHT_COLOURS = WarningKind("light_colours",
 LIGHT_FRAME = WarningKind("light_frame",
     "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated, or half vectors",
     "`--light-frame` or `info --mended-lights`, as the warning says", severity="error")
-LIGHT_ORDER = WarningKind("light_order", "The lights are probably in another order than the images",
+LIGHT_ORDER = WarningKind("light_order", "The order of the lights probably differs from that of the images",
     "Correct the light file", severity="error")
 LIGHTS_ILL_CONDITIONED = WarningKind("lights_ill_conditioned", "The lights determine the normals poorly",
     "Add lights from other sides")
@@ -123,7 +125,7 @@ LIGHTS_IN_CHANNELS = WarningKind("lights_in_channels",
     "The channels are read as images under three lamps, as `--lights-in-channels` requests; coloured objects get wrong "
     "normals",
     "A [crosstalk matrix](coloured-lights.md), and gray objects")
-LIGHTS_MATCHED = WarningKind("lights_matched", "Lights were matched to images by another rule than the full name",
+LIGHTS_MATCHED = WarningKind("lights_matched", "Lights were matched to images by a rule other than the full name",
     "Check the order of the lights")
 LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the camera axis", "Add lower lights")
 LIGHTS_UNCHECKED = WarningKind("lights_unchecked",
@@ -133,35 +135,38 @@ LOW_CONFIDENCE = WarningKind("low_confidence", "The network predicts large error
     "Check the lights, the mask and the images", severity="error")
 MASK_CHOICE = WarningKind("mask_choice",
     "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the images, is used as "
-    "the mask; several such pictures are ignored", "`--mask FILE` for another one")
+    "the mask; if there are several such pictures, they are ignored", "`--mask FILE` for another one")
 MASK_INVERTED = WarningKind("mask_inverted", "The mask excludes a bright area in the middle",
     "Invert it: white on the object", severity="error")
 NEAR_LAMPS = WarningKind("near_lamps",
-    "The folder has positions, or vectors look like positions, but the lights are treated as distant",
+    "The folder contains lamp positions, or vectors look like positions, but the lights are treated as distant",
     "`--light-positions FILE`, or leave `--lights` out")
 NEAR_LIGHTS_SUSPECTED = WarningKind("near_lights_suspected",
     "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
     "[Specify their positions](near-lamps.md)", severity="error")
-NO_MASK = WarningKind("no_mask", "No mask excludes pixels, and most of them are nearly black",
+NO_MASK = WarningKind("no_mask", "There is no mask that excludes pixels, and most pixels are nearly black",
     "`--auto-mask`, or a mask")
 NONLINEARITY_SUSPECTED = WarningKind("nonlinearity_suspected",
     "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read as linear",
     "`--transfer srgb` or `gamma:2.2`", severity="error")
-NOT_DISTILLED = WarningKind("not_distilled", "A small network could not learn this large capture, so it took longer",
+NOT_DISTILLED = WarningKind("not_distilled",
+    "A small network could not learn this large capture, so the computation took longer",
     "none; `--method iw12` is faster")
 PROFILE_UNREAD = WarningKind("profile_unread", "The curve of a colour profile cannot be read",
     "`--transfer linear`, `srgb` or `gamma:G`")
 REFINED_LIGHTS = WarningKind("refined_lights", "`--refine-lights` moved the light directions",
-    "Compare with the given directions")
+    "Compare them with the given directions")
 REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
-REPEATED_IMAGES = WarningKind("repeated_images", "Two images are equal, but their lights differ", "Replace one of them",
+REPEATED_IMAGES = WarningKind("repeated_images",
+    "Two images are identical, but their lights differ", "Replace one of them",
     severity="error")
-ROUGH_LIGHTS = WarningKind("rough_lights", "Refined light directions would fit much better",
+ROUGH_LIGHTS = WarningKind("rough_lights",
+    "Refined light directions would fit the images much better than the given ones",
     "[`--refine-lights`](infer.md#rough-directions), or measure them again")
 ROUGHNESS_UNDETERMINED = WarningKind("roughness_undetermined",
-    "With `--maps material`: highlights are too few, or normals too uncertain, to [determine the "
+    "With `--maps material`: there are too few highlights, or the normals are too uncertain, to [determine the "
     "roughness](materials.md#limits)", "Add lights, some of them near the camera axis")
-SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Expose shorter")
+SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure")
 UNEQUAL_INTENSITIES = WarningKind("unequal_intensities",
     "Light intensities look unequal, but the images do not determine them; or given intensities do not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file", severity="error")

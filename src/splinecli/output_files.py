@@ -98,7 +98,7 @@ class MapPart:
 # fmt: off
 _ROWS = (
     OutputMap(name="albedo", make="splinecli.results.maps:albedo",
-        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear RGB, up to one scale."
+        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear RGB, up to a factor."
         " The picture is 8-bit sRGB, the EXR file float16",
         unit="linear RGB", suffixes=("npy", "exr", "png"), picture="splinecli.pictures.maps:albedo_picture",
         caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white", reads_images=True,
@@ -117,7 +117,7 @@ _ROWS = (
         unit="slopes dz/dx and dz/dy, x right, y up", suffixes=("npy", "tiff")),
     OutputMap(name="curvature", make="splinecli.results.maps:curvature",
         content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
-        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 for each part",
+        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 per pixel",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2", scale=CURVATURE_SCALE,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel"),
     OutputMap(name="relief", make="splinecli.results.maps:relief",

@@ -115,7 +115,7 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
         (("--transfer", "rec709"), 2, "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"),
         (("--white-level", "0"), 2, "--white-level is '0'; expected a number above 0"),
         (("--weights", "spline-net"), 2, "method ls uses no weights"),
-        (("--maps", "confidence"), 2, "method ls gives no confidence"),
+        (("--maps", "confidence"), 2, "method ls does not provide confidence"),
         (("--update", "--overwrite"), 2, "--overwrite and --update contradict each other"),
     ],
 )

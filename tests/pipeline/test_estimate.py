@@ -88,7 +88,7 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
 
 def test_refused() -> None:
     for few, estimator, problem in (
-        (capture(3000), LeastSquares(), "method ls gives no confidence and cannot be distilled"),
+        (capture(3000), LeastSquares(), "method ls does not provide confidence and cannot be distilled"),
         (capture(200), Slow(), "matte: 200 pixels are too few to distil"),
     ):
         with pytest.raises(UsageError, match=problem):

@@ -45,7 +45,7 @@ class View:
         return self.source != "assumed distant"
 
     def draw(self, generator: np.random.Generator) -> Float64Array:
-        """Return a matrix (3, 3) that may be the true one."""
+        """Draw a matrix (3, 3) at random from those that may be the true one."""
         matrix = self.matrix.copy()
         if not self.known:
             # All rays of sight from parallel ones to the shortest lens, evenly.

@@ -67,7 +67,7 @@ def _fit(values: Floats, cosines: Float64Array, known: Bools, path: Path) -> Flo
     if values.shape[1] != CHANNELS:
         raise InputError("the image is gray, expected a colour image under three lamps", path=path)
     if np.count_nonzero(known) < _MIN_PIXELS:
-        raise InputError("the gray ball is overexposed", path=path, hint="Expose shorter")
+        raise InputError("the gray ball is overexposed", path=path, hint="Use a shorter exposure")
     shading, values = np.maximum(cosines[known], 0), values[known].astype(np.float64)
     rows = []
     for channel in values.T:

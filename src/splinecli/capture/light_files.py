@@ -351,7 +351,7 @@ def read_lights(
 
 
 def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
-    """Return the encoder of the format that a file's suffix names. Raises UsageError for one that is only read."""
+    """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only be read."""
     encode = format_of(path).encode
     if encode is None:
         *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))

@@ -94,7 +94,7 @@ def _read_alicevision(document: Any, path: Path) -> NumberRows:
         try:
             light = convert(values, _Light)
         except ValidationError as error:
-            hint = "Calibrate for distant lights, one direction a light"
+            hint = "Calibrate for distant lights, with one direction for each light"
             raise InputError(f"light {number}: {error}", path=path, hint=hint) from None
         names.append(image_name(str(number if light.view is None else light.view), []))
         x, y, z = light.direction

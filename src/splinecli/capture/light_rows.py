@@ -42,7 +42,7 @@ class LightFrame:
         return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
 
     def __str__(self) -> str:
-        """Return the value of --light-frame, such as "x-left,y-down", without axes that are as usual."""
+        """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual direction are left out."""
         words = [EXCHANGED] if self.exchanged else []
         words += [name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1]
         return ",".join(words) or "x-right,y-up"

@@ -92,7 +92,7 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
         found = re.fullmatch(r"\d{1,9}(?:,\d{1,9}){3}", crop.replace(" ", ""))
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
-            problem = f"--crop is {crop!r}; expected X,Y,W,H: the left upper corner and the size in pixels"
+            problem = f"--crop is {crop!r}; expected X,Y,W,H: the upper left corner and the size in pixels"
             raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
     found = re.fullmatch(r"1(?:/(\d{1,3}))?", "1" if scale is None else scale.replace(" ", ""))
     step = int(found[1] or 1) if found else 0
@@ -107,7 +107,7 @@ class RadiometricCalibration:
 
     curve: TransferCurve = 1.0  # the images' transfer curve
     ambient: Path | None = None  # an image under ambient light alone, which is subtracted from all others
-    # images of an evenly white surface, one for each light or one for all. Images are divided by them
+    # images of a uniform white surface, one for each light or one for all. Images are divided by them
     flat_field: tuple[Path, ...] = ()
     automatic: bool = False  # whether the curve that all images state is used instead of `curve`
 

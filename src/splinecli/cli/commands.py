@@ -30,12 +30,13 @@ def calibrate(options: CalibrateOptions) -> None:
 
     A BALL is a folder with one image for each light, in the order of the lights. The outline of the ball comes from
     --circle or a mask (--mask, or a file named mask in the folder). Otherwise it is detected in an image named ref, or
-    in the mean of all images. The brightest spot in the ball is the lamp. Directions of several balls are averaged.
+    in the mean of all images. The brightest spot in the ball is taken as the lamp. Directions of
+    several balls are averaged.
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
     calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.
-    With at least two balls, or one ball at two places, near lamps and a known camera, it also writes
-    light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
+    If the lamps are near, the camera is known, and there are at least two balls or one ball at two places, it also
+    writes light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
     from splinecli.pipeline.calibrate import DIRECTIONS, calibrate_lights
 
@@ -124,8 +125,8 @@ def prepare(options: PrepareOptions) -> int:
 
     A pixel set has the true normal of each pixel and its observations under all lights. Writes SET/manifest.json, a
     folder for each capture and scene, and the overview SET/contact_sheet.png. The same command continues after an
-    interruption, and adds to a set that exists. Captures that cannot be read are reported and skipped. Rendering needs
-    the extra packages of 'splinecli[render]'.
+    interruption, and adds to an existing set. Captures that cannot be read are reported and skipped. Rendering needs
+    the extra 'render'.
     """
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import prepare_pixel_set

@@ -1,4 +1,4 @@
-"""`splinecli infer`, `watch` and `info`: captures in, normal maps out, or a summary of the captures."""
+"""`splinecli infer`, `watch` and `info`: normal maps of captures, or a summary of a capture."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the la
 def infer(context: Context, options: InferOptions, batch: BatchOptions, cluster: ClusterOptions) -> int:
     """Estimate the normal map of each CAPTURE.
 
-    A CAPTURE is a folder with the images of one object. A fixed camera took them under different lights. The light file
-    is in the folder, or --lights names it. With --lights estimate, a CAPTURE may be a film. Writes
+    A CAPTURE is a folder with images of one object, taken by a fixed camera under different lights. The light file is
+    in the folder, or is given by --lights. With --lights estimate, a CAPTURE may be a film. Writes
     OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if there is ground truth. With several
     captures, OUT/index.html links the results.
 
-    Captures that are already done are skipped. If files or options of a capture have changed, infer reports it and
+    Captures that are already done are skipped. If files or options of a capture have changed, infer reports this and
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
     The most serious failure determines the exit code.
     """
@@ -112,10 +112,10 @@ def _summary(report: dict[str, Any], output: Path) -> str:
 def watch(context: Context, options: WatchOptions) -> None:
     """Run infer on each capture that arrives in FOLDER, once it is complete.
 
-    A capture is a subfolder of FOLDER, or a film with --lights estimate. It is computed as by infer with OPTIONS, and
-    captures that are already done are skipped, so the command can be stopped and started again at any time. A capture
-    that fails does not stop it. It is tried again when its files change. If FOLDER vanishes, the command waits for it.
-    Ctrl-C or SIGTERM ends the command, with exit code 130.
+    A capture is a subfolder of FOLDER, or a film with --lights estimate. Each one is processed as infer does with
+    OPTIONS. Captures that are already done are skipped, so the command can be stopped and started again at any time. It
+    continues after a capture fails, and tries that capture again when its files change. If FOLDER vanishes, the command
+    waits for it. Ctrl-C or SIGTERM ends the command, with exit code 130.
     """
     from splinecli.pipeline.incoming import Arrivals
 
@@ -156,7 +156,7 @@ def watch(context: Context, options: WatchOptions) -> None:
 
 
 def info(reading: Reading, options: InfoOptions) -> int:
-    """Show what `infer` would read from CAPTURE, without running it.
+    """Describe CAPTURE as `infer` would read it, without estimating normals.
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
     the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing

@@ -126,7 +126,7 @@ def _descend(
 
 
 def find_rings(lights: Float64Array) -> Iterator[list[Integers]]:
-    """Yield divisions of the lights (F, 3) into rings, as the indices of the lights of each ring that has enough."""
+    """Yield divisions of the lights (F, 3) into rings, as the indices of the lights in each ring with enough lights."""
     elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
     order = elevation.argsort(kind="stable")
     # Lights belong to one ring if their elevations follow each other at smaller steps.

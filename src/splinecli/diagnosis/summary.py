@@ -36,7 +36,7 @@ _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of
 
 
 def grid_of(mask: Bools) -> Part:
-    """Return the rows and columns of a grid with at most about MAX_PIXELS pixels of the mask (H, W)."""
+    """Return the rows and columns of a grid that contains about MAX_PIXELS pixels of the mask (H, W), or fewer."""
     step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
     return slice(None, None, step), slice(None, None, step)
 

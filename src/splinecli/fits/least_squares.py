@@ -115,7 +115,7 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """Normals from all lights, and the disagreement between two halves of the lights. The signs are arbitrary."""
+    """Normals from all lights, and the disagreement between two halves of the lights, whose sign is arbitrary."""
 
     normals: Tensor  # (P, 3), unit, of least squares with all lights
     # (P, 3), the least-squares solution for the residuals, with the sign flipped in one half, as a share of the albedo.

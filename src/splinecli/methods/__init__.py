@@ -110,7 +110,7 @@ def _network(
 METHODS: dict[str, Method] = {
     "spline-net": Method(
         partial(_network, weights="spline-net"),
-        "LI-Net and NE-Net, the refinement nets, and indirect light removed",
+        "LI-Net and NE-Net, removal of indirect light, and the refinement nets",
         "Zheng et al., ICCV 2019, with [changes](method.md)",
         observation_maps=True,
     ),
@@ -146,7 +146,7 @@ METHODS: dict[str, Method] = {
     ),
     "spline-net-pixelwise": Method(
         partial(_network, weights="spline-net", refines=False),
-        "`spline-net` without the refinement nets and with indirect light",
+        "`spline-net` without the refinement nets and without removal of indirect light",
         observation_maps=True,
     ),
 }

@@ -28,7 +28,7 @@ FEWEST_PIXELS = 64  # the smallest sample that can be learned from
 
 @dataclass(frozen=True)
 class StudentSize:
-    """How much is learned."""
+    """The size of a distilled network, of its sample and of its training."""
 
     sample: int  # number of pixels that the network estimates
     steps: int  # steps of learning

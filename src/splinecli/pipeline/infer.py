@@ -108,7 +108,7 @@ def distil_for(
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not estimator.has_confidence:
-        return refuse(f"method {estimator.name} gives no confidence and cannot be distilled")
+        return refuse(f"method {estimator.name} does not provide confidence and cannot be distilled")
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
@@ -265,7 +265,7 @@ def make_method(options: InferOptions) -> Estimator:
         raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
     for name in options.maps:
         if MAPS[name].needs_confidence and not estimator.has_confidence:
-            raise UsageError(f"method {options.method} gives no {name}", hint=f"Leave {name} out of --maps")
+            raise UsageError(f"method {options.method} does not provide {name}", hint=f"Leave {name} out of --maps")
     return estimator
 
 

@@ -133,11 +133,11 @@ class Reading(Record, frozen=True, kw_only=True):
     mask: Annotated[FileName | None, Option("Input", "FILE",
         MASK_IMAGE.format("object"), default="a file named mask.*, or all pixels")] = None
     crop: Annotated[str | None, Option("Input", "X,Y,W,H",
-        "Read this box of the images: left upper corner and size in pixels.")] = None
+        "Read this box of the images: upper left corner and size, in pixels.")] = None
     scale: Annotated[str | None, Option("Input", "1/N", "Read every N-th row and column, for a first look.",
         default="all")] = None
     align: Annotated[bool, Option("Input", "",
-        "Align images that were shifted, rotated or zoomed between exposures to the first one.")] = False
+        "Align the images to the first one, if they were shifted, rotated or zoomed between exposures.")] = False
     ground_truth: Annotated[FileName | None, Option("Input", "FILE",
         "True normals to compare with (.mat, .npy, text, PNG, TIFF).")] = None
     transfer: Annotated[str, Option("Input", "CURVE",
@@ -146,11 +146,11 @@ class Reading(Record, frozen=True, kw_only=True):
     ambient: Annotated[FileName | None, Option("Input", "FILE",
         "Image taken without the lights, to subtract from all images.", default="ambient.*")] = None
     flat_field: Annotated[FileName | None, Option("Input", "DIR",
-        "Folder with images of an evenly white surface: one for all lights, or one for each light.")] = None
+        "Folder with images of a uniform white surface: one for all lights, or one for each light.")] = None
     white_level: WhiteLevel = None
     lights: Annotated[FileName | None, Option("Lights", "FILE|estimate",
         f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate derives them from the"
-        " images, with lower accuracy.", default="the light file in CAPTURE")] = None
+        " images, less accurately than a calibration.", default="the light file in CAPTURE")] = None
     first_light: Annotated[str | None, Option("Lights", "SIDE|DEGREES",
         "With --lights estimate: the side that the first light comes from, such as left, above or upper-left, or its"
         " azimuth, counter-clockwise from the right. Needed if the images show no outline of the object.",
@@ -160,8 +160,8 @@ class Reading(Record, frozen=True, kw_only=True):
         default="x right, y up, z to the camera",
         complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)))] = None
     light_format: Annotated[LightForm, Option("Lights", "",
-        "Numbers of a light in a text file: a vector x y z; azel, azimuth and elevation; or slant-tilt, the"
-        " angles of HALCON. Angles are in degrees.")] = "xyz"
+        "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or slant-tilt, the angles of"
+        " HALCON. Angles are in degrees.")] = "xyz"
     intensities: Annotated[FileName | None, Option("Lights", "FILE|equal",
         "Light intensities: a line r g b for each image.",
         default="equal, or estimated if the images show that they differ")] = None
@@ -308,7 +308,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         f"Method to use: {records.listed(method_names())}.", complete=method_names())] = DEFAULT_METHOD
     weights: Weights = None
     distil: Annotated[bool | None, Option("Speed", "",
-        "Approximate the network by a smaller one, trained on a sample of the capture's pixels, or use the method on"
+        "Approximate the network with a smaller one, trained on a sample of the capture's pixels, or use the method on"
         " every pixel.", default="--distil from 100,000 pixels, else --exact", names=("--distil/--exact",))] = None
     device: DeviceName = "auto"
     precision: PrecisionName = "auto"
@@ -318,8 +318,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.", names=("--format",),
         items=NORMALS)] = ("png", "npy")
     maps: Annotated[tuple[str, ...], Option("Output", "LIST",
-        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
-        " pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.", items=MAPS)] = ()
+        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 makes heights"
+        " of 2 pixels white in the picture, and curvature:0.1 a mean curvature of 0.1 per pixel.", items=MAPS)] = ()
     curvature_scale: Positive = CURVATURE_SCALE
     relief_scale: Positive = RELIEF_SCALE
     html: Annotated[bool, Option("Output", "",
@@ -431,7 +431,7 @@ class BatchOptions(Record, frozen=True, kw_only=True):
     as_json: Annotated[bool, Option("Output", "", "Print a JSON list of the reports on stdout, and nothing else.",
         names=("--json",))] = False
     as_json_lines: Annotated[bool, Option("Output", "",
-        "Print each report as one line of JSON on stdout when its capture ends.", names=("--jsonl",))] = False
+        "Print each report as one line of JSON on stdout as soon as its capture is done.", names=("--jsonl",))] = False
     quiet: Quiet = False
 
     def __post_init__(self) -> None:
@@ -451,13 +451,13 @@ class WatchOptions(Record, frozen=True, kw_only=True):
     """The options of `watch`; see its help."""
 
     folder: Annotated[Path, Option("Arguments", "FOLDER",
-        "Folder in which captures arrive, a subfolder or film for each.")]
+        "Folder in which captures arrive, each as a subfolder or a film.")]
     options: Annotated[tuple[str, ...], Option("Arguments", "-- OPTIONS", "Options of infer, after two dashes.",
         repeated=True)] = ()
     marker: Annotated[str | None, Option("Captures", "NAME", "File that appears in a subfolder when it is complete.",
         default="see --settle")] = None
     settle: Annotated[NotNegative, Option("Captures", "SECONDS",
-        "A film, or without --marker a subfolder, is complete when nothing in it changed for so long.")] = 5.0
+        "A film, or a subfolder without --marker, is complete when it has not changed for this long.")] = 5.0
 
 
 class InfoOptions(Display, frozen=True, kw_only=True):
@@ -466,9 +466,8 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     capture: Annotated[Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")]
     auto_mask: Annotated[bool, Option("Input", "", "If there is no mask, find the object in the images.")] = False
     check_lights: Annotated[bool, Option("Lights", "",
-        "List other readings of the light file, and how well the images fit each.")] = False
+        "List other readings of the light file, and how well each of them fits the images.")] = False
     mended_lights: Annotated[Path | None, Option("Lights", "FILE",
-        "Write the light directions in the order and frame that fit the images best, if the light file does"
-        " not.")] = None
+        "If the light directions fit the images better in another order or frame, write them in it.")] = None
     plot: Annotated[Path | None, Option("Output", "FILE", "Also plot the light directions to a PNG file.")] = None
     overwrite: Annotated[bool, Option("Output", "", "Replace an earlier plot or file of lights.")] = False

@@ -50,7 +50,7 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
     masks: Annotated[tuple[Path, ...], Option("Input", "FILE",
         f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.", names=("--mask",), repeated=True)] = ()
     ball_diameter: Annotated[Positive | None, Option("Input", "D",
-        "Diameter of each ball in any unit, such as millimeters: the unit of the lamps' positions.",
+        "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the same unit.",
         default="pixels")] = None
     camera_matrix: Annotated[Path | None, Option("Input", "FILE", "Text file of the 3 x 3 camera matrix in pixels.",
         default="focal length from EXIF, or a distant camera")] = None
@@ -59,8 +59,8 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
     gray_card: Annotated[Path | None, Option("Light intensities", "DIR",
         "Images of a matte gray card that faces the camera.")] = None
     lights_in_channels: Annotated[bool, Option("Light intensities", "",
-        "The images of the gray ball are colour images under three coloured lamps at once: measure their crosstalk."
-        " BALL has an image under each lamp alone, in the order R, G, B.")] = False
+        "The images of the gray ball are colour images under three coloured lamps at once: measure the crosstalk."
+        " BALL then contains one image under each lamp alone, in the order R, G, B.")] = False
     transfer: Annotated[str, Option("Light intensities", "CURVE",
         "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
         complete=shared.CURVES)] = AUTOMATIC
@@ -318,7 +318,7 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     meshes: Annotated[tuple[Path, ...], Option("Scenes", "FILE",
         "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.", names=("--mesh",), repeated=True)] = ()
     views: Annotated[Natural, Option("Scenes", "N",
-        "Render each mesh N times, from random views. By default once, along its +z axis.")] = 0
+        "Render each mesh N times, from random views. 0 renders it once, along its +z axis.")] = 0
     reliefs: Annotated[tuple[Path, ...], Option("Scenes", "FILE",
         "Put this tileable normal map on half of the scenes. May be repeated.", names=("--relief",),
         repeated=True)] = ()

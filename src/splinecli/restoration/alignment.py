@@ -210,7 +210,7 @@ def _pyramid(images: Float32Array, mask: Bools) -> Iterator[tuple[Float32Array, 
 
 
 def _first_lights(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Float64Array:
-    """Return the lights with intensities that fit the unaligned images, or the images' largest components."""
+    """Return the lights with intensities that fit the unaligned images; without lights, three singular vectors."""
     values = images[:, mask].astype(np.float64)
     if lights is None:
         left, sizes, _ = np.linalg.svd(values, full_matrices=False)

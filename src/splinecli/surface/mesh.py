@@ -236,10 +236,10 @@ def _mesh_of_blocks(
     normal_map: Floats,
     largest_step: float | None,
 ) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None if they would be too few, or the map is small.
+    """Return a mesh of blocks of a large map's pixels; None if its triangles would be too few, or the map is small.
 
-    Collapsing all edges of a large map takes much memory. If far fewer triangles are requested, a mesh of the blocks,
-    with at least four times as many, has the same shape, and the normal texture keeps the detail.
+    Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels are requested, a mesh
+    of blocks with at least four times the requested number has the same shape, and the normal texture keeps the detail.
     """
     step = int((2 * np.count_nonzero(mask) / (4 * n_triangles)) ** 0.5)
     if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:

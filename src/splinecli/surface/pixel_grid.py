@@ -49,7 +49,7 @@ def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats |
 
 
 def focal_length(camera_matrix: Floats) -> float:
-    """Return the focal length in pixels: the geometric mean of both axes."""
+    """Return the focal length in pixels: the geometric mean of its values along both axes."""
     return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))
 
 

@@ -102,7 +102,7 @@ class PrincipledMaterial:
 
 
 def choose(condition: Tensor, first: PrincipledMaterial, second: PrincipledMaterial) -> PrincipledMaterial:
-    """Return the materials of `first` where condition (P, 1) is true, else of `second`. Both have P pixels."""
+    """Return the materials of `first` where the condition (P, 1) is true, else of `second`. Both have P pixels."""
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     return PrincipledMaterial(*(torch.where(condition, one, other) for one, other in pairs))
 

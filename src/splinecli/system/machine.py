@@ -61,9 +61,9 @@ _GROUP_FILES = (  # the limit, the use, and the file cache within it
 
 
 def available_memory() -> float:
-    """Return the bytes of memory that this process may still use; infinity if the system does not report it.
+    """Return the number of bytes that this process may still allocate; infinity if the system does not report it.
 
-    It is the least of the machine's free memory, the limits of the process's control groups, and the limit on its
+    It is the smallest of the machine's free memory, the limits of the process's control groups, and the limit on its
     address space (ulimit -v).
     """
     in_groups = map(_left_in_group, own_groups("memory"))

@@ -140,7 +140,7 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network, which may also have an error head, refinement nets and capture context."""
+    """Copy the weights into the network, which may have an error head, refinement nets or context that they lack."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:

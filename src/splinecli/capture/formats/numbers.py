@@ -296,7 +296,7 @@ def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: boo
 
 
 def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield type and bytes of the parts of a matrix: flags, sizes, name, numbers. Each is filled up to 8 bytes."""
+    """Yield the type and bytes of each part of a matrix: flags, sizes, name, numbers. Parts are padded to 8 bytes."""
     place = 0
     while place + _TAG_BYTES <= len(content):
         kind, length = struct.unpack_from(order + "II", content, place)
