@@ -7,6 +7,7 @@ from pkgutil import resolve_name
 
 import numpy as np
 import pytest
+import typer
 from numpy.typing import NDArray
 
 import make_tables
@@ -15,6 +16,7 @@ from html_page import REPORT
 from splinecli.capture import Capture
 from splinecli.capture.files import NOT_PHOTOGRAPHS
 from splinecli.capture_warnings import WARNINGS, CaptureWarning, WarningKind
+from splinecli.cli.main import app
 from splinecli.diagnosis import checks
 from splinecli.errors import InputError
 from splinecli.inference import NormalEstimate, estimate_normals
@@ -111,7 +113,8 @@ def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert results_bytes(100, 4, maps=["slant"]) - results_bytes(100, 4) == 700
     page = result_page(REPORT, estimate.normal_map, mask, values={"slant": values})
     assert "<figcaption>Slant</figcaption>" in page
-    assert InferOptions(maps=("slant",)).maps == ("slant",)
+    given = typer.main.get_command(app).commands["infer"].make_context("infer", ["x", "--maps", "slant:0.5"]).params
+    assert InferOptions.from_arguments(given).map_scales == (("slant", 0.5),)
 
 
 def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray[np.float32]:

@@ -22,7 +22,6 @@ FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
 PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")  # of the other commands
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # the values shown as white in the pictures by default
 BYTES_OF_SURFACE = 600  # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 
 
@@ -118,12 +117,12 @@ _ROWS = (
     OutputMap(name="curvature", make="splinecli.results.maps:curvature",
         content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
         " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 per pixel",
-        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2", scale=CURVATURE_SCALE,
+        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2", scale=0.05,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel"),
     OutputMap(name="relief", make="splinecli.results.maps:relief",
         content="heights without the overall shape; float32, H x W, in pixels, NaN outside the mask. The high-pass"
         " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
-        unit="heights in pixels", scale=RELIEF_SCALE,
+        unit="heights in pixels", scale=1.0,
         scale_text="height, black -{scale}, gray 0, white {scale} pixels", bytes_per_pixel=BYTES_OF_SURFACE),
     OutputMap(
         name="material",
@@ -147,7 +146,6 @@ _ROWS = (
 )
 # fmt: on
 MAPS = {row.name: row for row in _ROWS}
-SCALED_MAPS = tuple(row.name for row in _ROWS if row.scale is not None)
 
 
 def own_files() -> list[str]:

@@ -356,7 +356,7 @@ def _make_files(
         for warning in material_warnings(facts):
             report["warnings"].append({"code": warning.code, "text": warning.text})
             observer.warn(f"{capture.name}: {warning}")
-    scales = {"curvature": options.curvature_scale, "relief": options.relief_scale}
+    scales = dict(options.map_scales)
 
     def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
         """Yield the files of a map, which is computed when they are written unless it already exists."""

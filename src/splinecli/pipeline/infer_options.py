@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from functools import partial
 from importlib import resources
@@ -27,7 +28,7 @@ from splinecli.errors import UsageError
 from splinecli.maths.normals import Convention
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
-from splinecli.output_files import CURVATURE_SCALE, MAPS, NORMALS, RELIEF_SCALE, SCALED_MAPS
+from splinecli.output_files import MAPS, NORMALS
 from splinecli.records import FileName, NotNegative, Option, Positive, Record, Seed
 from splinecli.restoration.alignment import MIN_IMAGES
 from splinecli.surface.bilateral_equations import DISCONTINUITY
@@ -284,13 +285,11 @@ class Reading(Record, frozen=True, kw_only=True):
         )
 
 
-_SCALE = {f"{name}_scale": "--maps" for name in SCALED_MAPS}  # fields that accompany the names of the maps
-
-
 class InferOptions(Reading, frozen=True, kw_only=True):
     """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options conflict."""
 
-    # The defaults follow. light_indices are zero-based, and the scales are the values shown as white in the pictures.
+    # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values shown as white, if
+    # they are not those of the rows in MAPS.
     auto_mask: Annotated[bool, Option("Input", "",
         "If there is no mask, find the object in the images and write found_mask.png.")] = False
     as_stored: AsStored = False
@@ -320,8 +319,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     maps: Annotated[tuple[str, ...], Option("Output", "LIST",
         f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 makes heights"
         " of 2 pixels white in the picture, and curvature:0.1 a mean curvature of 0.1 per pixel.", items=MAPS)] = ()
-    curvature_scale: Positive = CURVATURE_SCALE
-    relief_scale: Positive = RELIEF_SCALE
+    map_scales: tuple[tuple[str, Positive], ...] = ()
     html: Annotated[bool, Option("Output", "",
         "Also write page.html for interactive relighting, with all maps.")] = False
     surface: Annotated[bool, Option("Output", "",
@@ -353,27 +351,28 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
         """See Record. --maps also sets scales, and the seed only applies if the lights are drawn at random."""
-        scales, names = {}, []
+        scales, names = [], []
+        scaled = [row.name for row in MAPS.values() if row.scale is not None]
         for item in (given["maps"] or "").split(","):
             name, colon, scale = (part.strip() for part in item.partition(":"))
             names.append(name)
             if colon:
-                if name not in SCALED_MAPS or to_number(scale) is None:
-                    expected = " or ".join(f"{name}:NUMBER" for name in SCALED_MAPS)
+                if name not in scaled or not 0 < (to_number(scale) or 0) < math.inf:
+                    expected = " or ".join(f"{name}:NUMBER" for name in scaled)
                     raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
-                scales[f"{name}_scale"] = float(scale)
+                scales.append((name, float(scale)))
         if given["maps"] is not None:
             given["maps"] = ",".join(names)
         if given["n_lights"] is None:
             given["seed"] = None
-        return super().from_arguments(given).replace(**scales)
+        return super().from_arguments(given).replace(map_scales=tuple(scales))
 
     def changes(self, earlier: InferOptions) -> list[str]:
         """Return the options that affect the results, which excludes --output and --device."""
         kinds = records.field_types(type(self))
         names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
         options = {name: records.option_of(kinds[name]) for name in names if name not in ("output", "device")}
-        return list(dict.fromkeys(records.long_name(name, of) if of else _SCALE[name] for name, of in options.items()))
+        return list(dict.fromkeys(records.long_name(name, of) if of else "--maps" for name, of in options.items()))
 
     @property
     def method_options(self) -> MethodOptions:
