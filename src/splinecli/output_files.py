@@ -33,7 +33,8 @@ class OutputMap:
     make: "module:function" from a capture's source, its NormalEstimate and a progress function, called after each
         image, to float32 values (H, W) or (H, W, C), or None if the map is not available.
     content: for the documentation. unit: the description of the values in TIFF and EXR files.
-    picture: "module:function" from values and mask, and the scale if the map has one, to an 8-bit picture.
+    picture: "module:function" from values and mask, and the scale if the map has one, to an 8-bit picture. The default
+        needs a scale, so a map without one has its own function. Values outside the mask are zero, or NaN if unknown.
     scale: the value shown as white in the picture by default; scale_text: the description of the scale in the file.
     caption: below the picture on the page, which shows this map even if --maps does not name it; "" leaves it out.
     needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from splinecli.capture import read_light_directions, read_light_intensities
-from splinecli.capture.light_files import match_images, read_lights
+from splinecli.capture.light_files import check_writable, match_images, read_lights
 from splinecli.errors import InputError
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
@@ -178,6 +178,15 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
     assert how.startswith("name")
     found = dict(zip(images, directions, strict=True))
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".npy", ".lp", ".csv"])
+def test_written_lights_are_read_again(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"lights{suffix}"
+    path.write_bytes(check_writable(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)]))
+    np.testing.assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
+    if suffix == ".csv":
+        assert path.read_text().splitlines()[0] == "x,y,z"
 
 
 @pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])

@@ -39,6 +39,10 @@ def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
     return rows_text(directions).encode()
 
 
+def _encode_csv(directions: Float64Array, images: Sequence[Path]) -> bytes:
+    return ("x,y,z\n" + rows_text(directions).replace(" ", ",")).encode()
+
+
 def _encode_lp(directions: Float64Array, images: Sequence[Path]) -> bytes:
     rows = zip(images, rows_text(directions).splitlines(), strict=True)
     text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
@@ -69,7 +73,7 @@ FORMATS = (
     LightFormat("Relight", (".dome", ".json"), readers.read_json, ("*.dome",), 2),
     LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
     LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
-    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_text),
+    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_csv),
     LightFormat("MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2),
     LightFormat("OpenCV", (".yml", ".yaml", ".xml"), readers.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
 )

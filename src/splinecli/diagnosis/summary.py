@@ -29,9 +29,7 @@ class Sample:
 
 
 Part = tuple[slice, slice]  # rows and columns of the images
-# An image is dark if its 99 % quantile is below this share of the white level. A capture carries a warning with fewer
-# lights than these, or with all lights nearer than this angle to the camera axis.
-DARK = 0.05
+DARK = 0.05  # an image is dark if its 99 % quantile is below this share of the white level
 _ENOUGH = 1_000_000  # pixels for a quantile: its rank is uncertain by 0.01 % of the pixels
 
 

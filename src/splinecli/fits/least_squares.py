@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.fits.robust import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
+from splinecli.fits.robust import SHADOW_SHARE, SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
 from splinecli.maths.observation_map import dot
 
 # The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
@@ -71,7 +71,6 @@ def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:
     return (weight[:, None] @ directions)[:, 0]
 
 
-LAMBERTIAN_SHADOW_SHARE = 0.05
 _PRIOR = 1e-4
 
 
@@ -83,7 +82,7 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
     """
     # A row for each light: sums over lights and the steps below then run along the pixels, three times as fast.
     observed = observations.T.contiguous()
-    lit = torch.where(observed < LAMBERTIAN_SHADOW_SHARE, 1e-3, 1.0).to(observed)
+    lit = torch.where(observed < SHADOW_SHARE, 1e-3, 1.0).to(observed)
     if valid is not None:
         lit = lit * valid.T
     x, y, z = light_directions.unbind(-1)
@@ -167,7 +166,7 @@ def alternating_signs(light_directions: Tensor) -> Tensor:
 
 
 # Trimmed LS and IW12 leave out observations below this share of the pixel's quantile UNSHADED, as IW12's authors do.
-SHADOW_SHARE = 0.1
+FIT_SHADOW_SHARE = 0.1
 
 
 def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
@@ -182,7 +181,7 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
     middling = (observations >= darkest) & (observations <= brightest)
-    weight = lit_observations(observations, SHADOW_SHARE, middling)
+    weight = lit_observations(observations, FIT_SHADOW_SHARE, middling)
     scaled_normals, _ = weighted_least_squares(observations, light_directions, weight.to(observations.dtype))
     return scaled_normals
 
@@ -218,7 +217,7 @@ def solve_iw12(
     light_directions: Tensor,
     valid: Tensor | None = None,
     *,
-    shadow_share: float = SHADOW_SHARE,
+    shadow_share: float = FIT_SHADOW_SHARE,
     iterations: int = 20,
 ) -> Tensor:
     """Return scaled normals b (P, 3) of I = L b + e with sparse e: each error has its own variance gamma.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splinecli.fits import least_squares
 from splinecli.fits.least_squares import TwoHalves, weighted_sum
+from splinecli.fits.robust import SHADOW_SHARE
 from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_net import FEATURE_WIDTHS, MEDIAN_OFFSET, TENSOR, VECTORS
 
@@ -57,7 +58,7 @@ def refine_features(
         "mean": level,
         "deviation": ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
         "residual": 3 * (unexplained.square() @ mean).sqrt(),
-        "dark_share": (observed < least_squares.LAMBERTIAN_SHADOW_SHARE).to(observed.dtype) @ mean,
+        "dark_share": (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (3.0 * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
