@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from splinecli import training
 from splinecli.errors import ModelError, UsageError
 from splinecli.pipeline.options import parse_light_counts
-from splinecli.training import defaults
 from splinecli.training.config import (
     GENERATOR,
     PRESETS,
@@ -61,8 +61,8 @@ def test_presets_by_name() -> None:
         "eta": 1.0, "lambda_c": 50.0,
     }  # fmt: skip
     assert paper | published == paper
-    assert tuple(PRESETS) == defaults.PRESET_NAMES
-    assert defaults.DEFAULT_PRESET in PRESETS
+    assert tuple(PRESETS) == training.PRESET_NAMES
+    assert training.DEFAULT_PRESET in PRESETS
 
 
 def write(path: Path, text: str) -> Path:

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 from splinecli.networks.weights import load_weights
+from splinecli.training import METRICS
 from splinecli.training.config import TrainingConfig
-from splinecli.training.defaults import METRICS
 from splinecli.training.loop import WEIGHTS, Trainer
 from splinecli.training.run_files import read_metrics
 

@@ -14,9 +14,8 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights, save_weights
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
-from splinecli.training import loop
+from splinecli.training import METRICS, loop
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
-from splinecli.training.defaults import METRICS
 from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer, learning_rate
 from splinecli.training.objective import compute_losses
 from splinecli.training.run_files import Metrics, read_checkpoint_config, read_metrics

@@ -14,9 +14,8 @@ from splinecli.networks.weights import load_weights, resolve_weights, save_weigh
 from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.whole_capture import photograph_scene
-from splinecli.training import refinement, tasks
+from splinecli.training import WEIGHTS, refinement, tasks
 from splinecli.training.config import PRESETS, TrainingConfig
-from splinecli.training.defaults import WEIGHTS
 from splinecli.training.loop import Trainer
 from splinecli.training.refinement import STEPS_PER_EXAMPLE, SceneMaps, ScenePool, refinement_losses, stack_maps
 from splinecli.training.tasks import RefinementTask

@@ -9,8 +9,8 @@ import torch
 
 from scenes import decode_rgb
 from splinecli.output_files import CURVES, TRAINING_MAPS
+from splinecli.training import EVENTS, METRICS
 from splinecli.training.config import TrainingConfig
-from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.loop import Trainer
 from splinecli.training.run_files import Metrics, RunLog, read_metrics
 

@@ -7,9 +7,9 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from splinecli import training
 from splinecli.cli.console import Messages, print_report
 from splinecli.errors import InputError, OutputError, printable
-from splinecli.training import defaults
 
 if TYPE_CHECKING:
     from splinecli.evaluation.protocol import Evaluation
@@ -188,7 +188,7 @@ def train(options: TrainOptions) -> None:
     with open_run(settings, options.output, options.device, **how) as trainer:
         _run(trainer, Messages(quiet=options.quiet or not trainer.workers.leads))
         if not options.quiet and trainer.workers.leads:
-            print(printable(options.output / defaults.WEIGHTS))
+            print(printable(options.output / training.WEIGHTS))
 
 
 def _run(trainer: Trainer, messages: Messages) -> None:

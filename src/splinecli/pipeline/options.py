@@ -11,6 +11,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from splinecli import training
 from splinecli.capture.record import ESTIMATE
 from splinecli.errors import UsageError
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
@@ -22,7 +23,6 @@ from splinecli.pipeline.infer_options import HERE, MASK_IMAGE, OUTPUT, ClusterOp
 from splinecli.records import Count, FileName, Natural, NotNegative, Option, Positive, Record, Seed, listed
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import DEFAULT_FORMATS, LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
-from splinecli.training import defaults
 
 DEFAULT_TRIALS = 100
 TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
@@ -353,8 +353,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     sets: Annotated[tuple[Path, ...], Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.",
         repeated=True)] = ()
     preset: Annotated[str | None, Option("Settings", "NAME",
-        f"Settings to begin with: {', '.join(defaults.PRESET_NAMES)}.", default=defaults.DEFAULT_PRESET,
-        complete=defaults.PRESET_NAMES)] = None
+        f"Settings to begin with: {', '.join(training.PRESET_NAMES)}.", default=training.DEFAULT_PRESET,
+        complete=training.PRESET_NAMES)] = None
     config: Annotated[Path | None, Option("Settings", "FILE",
         "Settings from a TOML file or a run's config.json.")] = None
     param: Annotated[tuple[str, ...], Option("Settings", "NAME=VALUE",
@@ -367,13 +367,13 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     n_lights: Annotated[dict[str, int] | None, Option("Pixels", "K|MIN-MAX", "Number of lights of each pixel.",
         default="the preset's", parse=parse_light_counts)] = None
     steps: Annotated[Count | None, Option("Length", "N", "Train for N steps.",
-        default=f"{defaults.DEFAULT_STEPS:,}; presets paper: {defaults.PAPER_STEPS:,}, refine:"
-        f" {defaults.REFINE_STEPS:,}")] = None
+        default=f"{training.DEFAULT_STEPS:,}; presets paper: {training.PAPER_STEPS:,}, refine:"
+        f" {training.REFINE_STEPS:,}")] = None
     minutes: Annotated[Annotated[float, Meta(ge=0.01)] | None, Option("Length", "M",
         "Train for M minutes instead of a number of steps.", default="train for --steps")] = None
     resume: Annotated[bool, Option("Length", "", "Continue from the run's checkpoint.")] = False
     output: Annotated[Path, Option("Output", "RUN",
-        f"Folder of the run. Its files are updated every {defaults.CHECKPOINT_SECONDS} seconds.", names=OUTPUT)]
+        f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS} seconds.", names=OUTPUT)]
     tensorboard: Annotated[bool, Option("Output", "",
         "Also write RUN/tensorboard (needs the extra 'tensorboard').")] = False
     quiet: shared.Quiet = False

@@ -15,7 +15,7 @@ from splinecli.networks.weights import shipped_names
 from splinecli.records import BelowOne, Count, Natural, NotNegative, Share, settings
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.system.files import expanded, parse_json
-from splinecli.training.defaults import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
+from splinecli.training import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 
 GENERATOR = "generator"  # the online pixel generator among the sources; every other name is the path of a pixel set
 Norm = Literal["mean", "sum"]  # whether the values of a map's cells are averaged or summed

@@ -29,9 +29,8 @@ from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
-from splinecli.training import run_files
+from splinecli.training import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS, run_files
 from splinecli.training.config import Settings, TrainingConfig, check_resumable, configure
-from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_files import Metrics, RunCounters, RunLog
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask

@@ -24,8 +24,8 @@ from splinecli.pictures.plots import observation_map_figure, png_bytes, training
 from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.machine import import_extra
 from splinecli.system.publishing import refuse_link
+from splinecli.training import EVENTS, METRICS
 from splinecli.training.config import TrainingConfig
-from splinecli.training.defaults import EVENTS, METRICS
 from splinecli.training.tasks import SampleMaps
 
 
