@@ -359,7 +359,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
             if colon:
                 if name not in scaled or not 0 < (to_number(scale) or 0) < math.inf:
                     expected = " or ".join(f"{name}:NUMBER" for name in scaled)
-                    raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
+                    raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}, above 0")
                 scales.append((name, float(scale)))
         if given["maps"] is not None:
             given["maps"] = ",".join(names)
