@@ -5,7 +5,7 @@
 
 Both go on after an interruption. The pixels are those of the training of spline-net: their materials and faults are
 described in synthesis/. The network's tokens for them are stored, because it is not changed. A shard of 512 captures
-takes about a minute on one core and 17 MB, and 1,000 steps take half a minute.
+takes about a minute on one core and 22 MB, and 1,000 steps take half a minute.
 """
 
 import argparse

@@ -132,7 +132,7 @@ _ROWS = (
         " zero outside the mask. The pictures have 8 bits: base colour in sRGB, and glTF's texture with roughness in"
         " green and metalness in blue",
         reads_images=True,
-        bytes_per_pixel=170,  # the maps, and the shares of up to six glosses
+        bytes_per_pixel=170,  # the maps, and the gloss of each pixel
         bytes_per_observation=5,
         fewest_lights=4,
         parts=(

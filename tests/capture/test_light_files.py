@@ -1,5 +1,6 @@
 """Light files: every accepted way of writing one, as people have them, and the message for every wrong one."""
 
+import json
 import tempfile
 import time
 from pathlib import Path
@@ -178,6 +179,23 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
     assert how.startswith("name")
     found = dict(zip(images, directions, strict=True))
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("factors", "message"),
+    [([1, 2, 4, 8], None), ([1, 2, 4], "3 factors for 4 lights"), ([1, 2, 4, 1e-320], "not from 1e-12 to 1e")],
+)
+def test_factors_of_a_dome_are_inverse_intensities(tmp_path: Path, factors: list[float], message: str | None) -> None:
+    path = tmp_path / "a.dome"
+    lights = [dict(zip("xyz", row, strict=True)) for row in DIRECTIONS.tolist()]
+    path.write_text(
+        json.dumps({"directions": lights, "ledAdjust": [dict.fromkeys("rgb", factor) for factor in factors]})
+    )
+    if message is None:
+        np.testing.assert_allclose(read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T)
+    else:
+        with pytest.raises(InputError, match=message):
+            read_lights(path, 4)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".lp", ".csv"])

@@ -212,3 +212,14 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> Non
 def test_a_light_error_without_refined_lights_is_refused(run, rough: np.ndarray) -> None:
     result = run("evaluate", "bump", "--method", "ls", "--light-error-deg", "4")
     assert (result.code, "--light-error-deg needs --refine-lights" in result.err) == (2, True)
+
+
+def test_a_black_patch_amid_the_object(run, medallion):
+    """The check of the lights integrates its surface, also where no light reaches a pixel."""
+    for path in medallion.glob("[01]*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image[54:74, 54:74] = 0
+        cv2.imwrite(str(path), image)
+    result = run("infer", medallion, "--method", "ls")
+    assert result.code == 0
+    assert "black_pixels" in [warning["code"] for warning in read_report(Path("out/medallion"))["warnings"]]

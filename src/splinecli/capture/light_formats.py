@@ -126,8 +126,11 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
         raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
-    adjusted = len(factors) == len(vectors) and min(map(min, factors)) > 0
-    return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors if adjusted])
+    usable = all(1e-12 <= factor <= 1e12 for light in factors for factor in light)
+    if factors and not (usable and len(factors) == len(vectors)):
+        problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
+        raise InputError(problem if usable else 'a factor of "ledAdjust" is not from 1e-12 to 1e+12', path=path)
+    return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:

@@ -218,7 +218,7 @@ def _read_lights(
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         files = replace(files, images=images)
     if table.names is None:
-        return _drop_bad_lights(files, directions, None, warnings)
+        return _drop_bad_lights(files, directions, table.intensities, warnings)
     images, how = match_images(table, files.images)
     if len(images) < len(files.images):
         text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others were left out."

@@ -207,7 +207,9 @@ class ShadowCheck:
         part = slice(None, None, step), slice(None, None, step)
         rows = np.zeros(normals.mask.shape, np.intp)
         rows[normals.mask] = np.arange(len(observations))
-        coarse = RoughNormals(normals.normals[part], normals.mask[part], normals.outward[part])
+        known = normals.normals[part].any(axis=2, keepdims=True)
+        facing = np.where(known, normals.normals[part], (0.0, 0.0, 1.0))  # pixels amid black ones have no normal
+        coarse = RoughNormals(facing, normals.mask[part], normals.outward[part])
         chosen = np.linspace(0, len(lights) - 1, min(len(lights), 24)).astype(int)
         values = observations[rows[part][coarse.mask]].astype(np.float64)
         values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)

@@ -120,7 +120,7 @@ def estimate_material(
         base_colour=base / np.float32(exposure),
         roughness=gloss.roughness,
         metalness=gloss.metalness,
-        specular=gloss.level / np.float32(F0_OF_SPECULAR * exposure),
+        specular=np.minimum(gloss.level / exposure, 1).astype(np.float32) / np.float32(F0_OF_SPECULAR),
         confidence=np.asarray(1 - np.exp(-_SURE / gloss.roughness_error), np.float32),
         minnaert=gloss.minnaert,
         tail=gloss.tail,
