@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting, parts_of_pixels
 from splinecli.lights.rough_normals import cast_shadows
-from splinecli.materials.gloss import GlossMaps, estimate_gloss
+from splinecli.materials.gloss import blurred, estimate_gloss
 from splinecli.materials.lobes import (
     F0_OF_SPECULAR,
     Base,
@@ -25,6 +25,8 @@ from splinecli.materials.lobes import (
     predict_left_out,
 )
 from splinecli.maths import Bools, Float32Array, Floats
+from splinecli.methods.batched import float_tensors
+from splinecli.networks.material_net import Gloss
 from splinecli.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
@@ -118,12 +120,12 @@ def estimate_material(
     exposure = _exposure(base, gloss)
     return MaterialMaps(
         base_colour=base / np.float32(exposure),
-        roughness=gloss.roughness,
-        metalness=gloss.metalness,
-        specular=np.minimum(gloss.level / exposure, 1).astype(np.float32) / np.float32(F0_OF_SPECULAR),
-        confidence=np.asarray(1 - np.exp(-_SURE / gloss.roughness_error), np.float32),
-        minnaert=gloss.minnaert,
-        tail=gloss.tail,
+        roughness=gloss.roughness.numpy(),
+        metalness=gloss.metalness.numpy(),
+        specular=((gloss.log_level.exp() / exposure).clamp(max=1) / F0_OF_SPECULAR).numpy(),
+        confidence=(1 - (-_SURE / gloss.roughness_error).exp()).numpy(),
+        minnaert=gloss.minnaert.numpy(),
+        tail=gloss.tail.numpy(),
         matte=matte.copy(),
         trust=trust.clip(0, 1),
         white=white,
@@ -151,7 +153,7 @@ def render_gray(
     for chosen in parts_of_pixels(len(normals)):
 
         def column(values: Float32Array, chosen: PixelIndices = chosen) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(values[chosen], np.float32))[:, None]
+            return float_tensors(values[chosen])[0][:, None]
 
         geometry = Geometry.of(torch.from_numpy(normals[chosen]), directions, torch.from_numpy(error[chosen]))
         facets = facet_lobe(geometry, column(found.roughness), column(found.tail))
@@ -199,10 +201,9 @@ class _Pixels:
     def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> Sample:
         """Return some of the pixels as the fits need them; `bright` is the albedo of bright pixels."""
         light: PixelLighting = self.lighting_at(chosen)
-        observations = torch.from_numpy(np.asarray(light.observations, np.float32))
-        own = torch.from_numpy(np.ascontiguousarray(light.in_frame_of_pixels(self.normals[chosen]), np.float32))
-        directions = torch.from_numpy(np.asarray(light.directions, np.float32))
-        geometry = Geometry.of(own, directions, torch.from_numpy(self.normal_error[chosen]))
+        normals, normal_error = light.in_frame_of_pixels(self.normals[chosen]), self.normal_error[chosen]
+        observations, directions, *own = float_tensors(light.observations, light.directions, normals, normal_error)
+        geometry = Geometry.of(own[0], directions, own[1])
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
         floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
         return Sample(observations, geometry, reached.float(), floor, white)
@@ -219,21 +220,21 @@ class _Pixels:
         return max(float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE)), 1e-12), float(np.mean(whites))
 
 
-def _fit(sample: Sample, gloss: GlossMaps, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
+def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
     """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
     The columns are base, the contribution of white highlights to the weighted observations, which is not part of the
     base, and the results of _compare.
     """
 
-    def column(values: Float32Array) -> Tensor:
-        return torch.from_numpy(values[chosen])[:, None]
+    def column(values: Tensor) -> Tensor:
+        return values[chosen][:, None]
 
     geometry, roughness, metalness = sample.geometry, column(gloss.roughness), column(gloss.metalness)
     facets = facet_lobe(geometry, roughness, column(gloss.tail))
     of_facets = metalness * facets
     slope = (1 - metalness) * diffuse_lobe(geometry, column(gloss.minnaert)) + of_facets
-    offset = column(gloss.level) * (1 - metalness) * facets
+    offset = column(gloss.log_level).exp() * (1 - metalness) * facets
     usual = column(gloss.log_base).exp() * sample.observations.amax(1, keepdim=True)
     expected = Base(usual, _LAPLACE * column(gloss.log_base_error) * usual)
     base, weights = fit_base(sample, slope, offset, of_facets, lobe_error(geometry, roughness), expected)
@@ -259,12 +260,7 @@ def _compare(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> 
 
 def _smooth(values: Float32Array, mask: Bools) -> Float32Array:
     """Return the values (P,) averaged over their neighbours in a mask (H, W)."""
-    from cv2 import GaussianBlur
-
-    plane = np.zeros(mask.shape, np.float32)
-    plane[mask] = values
-    covered = GaussianBlur(mask.astype(np.float32), (0, 0), _SMOOTH)[mask]
-    return np.asarray(GaussianBlur(plane, (0, 0), _SMOOTH)[mask] / covered, np.float32)
+    return blurred(values, mask, _SMOOTH) / blurred(np.ones_like(values), mask, _SMOOTH)
 
 
 def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float32Array) -> Float32Array:
@@ -280,9 +276,9 @@ def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float3
     return np.asarray(np.divide(total, mean, out=np.ones_like(total), where=mean > 0))
 
 
-def _exposure(base: Float32Array, gloss: GlossMaps) -> float:
+def _exposure(base: Float32Array, gloss: Gloss) -> float:
     """Return the exposure at which dielectrics reflect as they usually do and no base exceeds white."""
     white = max(float(np.quantile(base.max(axis=1), _WHITE_QUANTILE)), 1e-9)
     dielectric = 1 - gloss.metalness
-    mean = float(dielectric @ gloss.level) / max(float(dielectric.sum()), 1e-9)
+    mean = float(dielectric @ gloss.log_level.exp()) / max(float(dielectric.sum()), 1e-9)
     return float(np.clip(mean / _DIELECTRIC, white, _MOST_EXPOSURE * white))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splinecli.errors import UsageError
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting
+from splinecli.maths import Floats
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
 from splinecli.methods.estimator import (
     TOWARDS_CAMERA,
@@ -109,6 +110,19 @@ Precision = Literal["float32", "bfloat16"]
 
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 
+
+def context_sample(lighting_at: LightingAt, n_pixels: int) -> tuple[Tensor, ...]:
+    """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a capture's pixels."""
+    light = lighting_at(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
+    pixels = sample_of(light.observations)
+    return float_tensors(light.observations[pixels], directions_at(light.directions, pixels))
+
+
+def float_tensors(*arrays: Floats) -> tuple[Tensor, ...]:
+    """Return 32-bit copies or views of arrays, whatever their strides, which tensors accept only when positive."""
+    return tuple(torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in arrays)
+
+
 ROTATION_SPAN_DEG = 20.0
 """Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
 
@@ -158,12 +172,7 @@ class NetworkEstimator(Estimator):
         """
         if not self.network.config.sees_capture or not n_pixels:
             return self
-        light = lighting_at(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
-        pixels = sample_of(light.observations)
-        sample, lights = (
-            torch.as_tensor(values, dtype=torch.float32, device=self.device)
-            for values in (light.observations[pixels], directions_at(light.directions, pixels))
-        )
+        sample, lights = (values.to(self.device) for values in context_sample(lighting_at, n_pixels))
         found = copy.copy(self)
         # One thread, so that the number of threads does not change the rounding.
         bfloat16 = torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16")

@@ -205,15 +205,14 @@ class SplineNet(nn.Module):
         """
         if self.set_branch is None or not self.config.sees_capture:
             return None
-        with torch.autocast(observations.device.type, enabled=False):
-            maps = self.build_maps(observations, light_directions, rotation=rotation)
-        return self._read_set(maps, _starting_normals(maps), 1, None)[2]
+        return self.encode_pixels(observations, light_directions, rotation=rotation)[1]
 
     def encode_pixels(
         self,
         observations: Tensor,
         light_directions: Tensor,
         valid: Tensor | None = None,
+        rotation: Rotation = NO_ROTATION,
         *,
         captures: int = 1,
         context: CaptureContext | None = None,
@@ -223,7 +222,7 @@ class SplineNet(nn.Module):
         The arguments are as in `forward` and `estimate`. Only for networks with a set branch.
         """
         with torch.autocast(observations.device.type, enabled=False):
-            maps = self.build_maps(observations, light_directions, valid)
+            maps = self.build_maps(observations, light_directions, valid, rotation)
         tokens, fitted, found = self._read_set(maps, _starting_normals(maps), captures, context)
         count = torch.full_like(maps.scale, observations.shape[1]) if valid is None else valid.sum(1, keepdim=True)
         return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count.to(maps.scale)), found
