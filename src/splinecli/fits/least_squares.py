@@ -49,19 +49,41 @@ RIDGE = 1e-12  # Weight of |b|^2. It matters only if the lights of positive weig
 
 
 def weighted_least_squares(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return b = C L' W I (P, 3), C = (L' W L + ridge)^-1, and the diagonal of L C L' (P, F), the variances of L b.
+    """Return b = C L' W I (P, 3), and the xx, yy, zz, xy, xz, yz (6, P) of C = (L' W L + ridge)^-1.
 
     Observations and weights are (P, F), and light directions (F, 3) or (P, F, 3). All are float64, because weights may
     differ by many orders of magnitude.
     """
+    solution, covariance = _solve(observations.T, light_directions, weight.T, _products(light_directions))
+    return solution.T, covariance
+
+
+def _products(light_directions: Tensor) -> Tensor:
+    """Return xx, yy, zz, xy, xz, yz of light directions (F, 3) or (P, F, 3), on the last axis."""
     x, y, z = light_directions.unbind(-1)
-    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
-    ridge = products.new_tensor((RIDGE,) * 3 + (0.0,) * 3)
-    covariance = inverse_3x3((weighted_sum(weight, products) + ridge).unbind(-1), RIDGE)
-    right_side = weighted_sum(weight * observations, light_directions)
-    scaled_normals = torch.stack(multiply_symmetric(covariance, right_side.unbind(-1)), dim=-1)
-    variances = dot(torch.stack(covariance, dim=-1), products * products.new_tensor((1.0, 1.0, 1.0, 2.0, 2.0, 2.0)))
-    return scaled_normals, variances
+    return torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+
+
+# Rows are lights and columns pixels here: sums over lights, and operations on matrices of 3 x 3, then run along the
+# pixels, three times as fast.
+
+
+def _solve(observed: Tensor, light_directions: Tensor, weight: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
+    """Return b (3, P) and the entries (6, P) of C of weighted_least_squares, from rows (F, P) of lights."""
+    xx, yy, zz, *mixed = _sum(products, weight).unbind()
+    covariance = inverse_3x3((xx + RIDGE, yy + RIDGE, zz + RIDGE, *mixed), RIDGE)
+    right_side = _sum(light_directions, weight * observed)
+    return torch.stack(multiply_symmetric(covariance, right_side.unbind())), torch.stack(covariance)
+
+
+def _sum(directions: Tensor, weight: Tensor) -> Tensor:
+    """Return the sums (K, P) of directions (F, K) or (P, F, K) with weights (F, P)."""
+    return directions.T @ weight if directions.ndim == 2 else weighted_sum(weight.T, directions).T
+
+
+def _dot(directions: Tensor, vectors: Tensor) -> Tensor:
+    """Return the dot products (F, P) of directions (F, K) or (P, F, K) with vectors (K, P)."""
+    return directions @ vectors if directions.ndim == 2 else dot(vectors.T, directions).T
 
 
 def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:
@@ -80,13 +102,11 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
     Each pixel's observations (P, F) are scaled to a largest value of 1. A zero pixel gives b = (0, 0, tiny). The light
     directions (F, 3) or (P, F, 3) are unit; all observations are valid (P, F) by default.
     """
-    # A row for each light: sums over lights and the steps below then run along the pixels, three times as fast.
     observed = observations.T.contiguous()
     lit = torch.where(observed < SHADOW_SHARE, 1e-3, 1.0).to(observed)
     if valid is not None:
         lit = lit * valid.T
-    x, y, z = light_directions.unbind(-1)
-    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+    products = _products(light_directions)
     # A weak prior towards the last solution keeps pixels with fewer than three lit lights solvable.
     prior = observed.new_tensor((_PRIOR,) * 3 + (0.0,) * 3)[:, None]
     solution = observed.new_tensor((0.0, 0.0, 1e-3))[:, None].expand(3, len(observations))
@@ -98,16 +118,6 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
         right_side = _sum(light_directions, weight * observed) + _PRIOR * solution
         solution = torch.stack(multiply_symmetric(inverse, right_side.unbind()))
     return solution.T
-
-
-def _sum(directions: Tensor, weight: Tensor) -> Tensor:
-    """Return the sums (K, P) of directions (F, K) or (P, F, K) with weights (F, P)."""
-    return directions.T @ weight if directions.ndim == 2 else weighted_sum(weight.T, directions).T
-
-
-def _dot(directions: Tensor, vectors: Tensor) -> Tensor:
-    """Return the dot products (F, P) of directions (F, K) or (P, F, K) with vectors (K, P)."""
-    return directions @ vectors if directions.ndim == 2 else dot(vectors.T, directions).T
 
 
 _TINY = 1e-9
@@ -192,20 +202,20 @@ def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     Iteratively reweighted least squares comes close to the minimum, where three residuals are zero. So the b that
     makes the three smallest residuals zero is used if it is better.
     """
-    weight = torch.ones_like(observations)
+    observed, products = observations.T.contiguous(), _products(light_directions)
+
+    def fit(weight: Tensor) -> tuple[Tensor, Tensor]:
+        solution, _ = _solve(observed, light_directions, weight, products)
+        return solution, (observed - _dot(light_directions, solution)).abs()
+
+    weight = torch.ones_like(observed)
     for step in range(50):
-        scaled_normals, residual = _fit(observations, light_directions, weight)
+        solution, residual = fit(weight)
         # Weights stop growing below a residual of 1e-7, for a largest observation of 1.
         weight = 1 / residual.clamp(min=max(1e-7, 0.1 * 0.5**step))
-    three = torch.zeros_like(weight).scatter_(1, weight.topk(3, dim=1).indices, 1.0)
-    vertex, residual_there = _fit(observations, light_directions, three)
-    better = residual_there.sum(dim=1, keepdim=True) < residual.sum(dim=1, keepdim=True)
-    return torch.where(better, vertex, scaled_normals)
-
-
-def _fit(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    scaled_normals, _ = weighted_least_squares(observations, light_directions, weight)
-    return scaled_normals, (observations - dot(scaled_normals, light_directions)).abs()
+    three = torch.zeros_like(weight).scatter_(0, weight.topk(3, dim=0).indices, 1.0)
+    vertex, residual_there = fit(three)
+    return torch.where(residual_there.sum(dim=0) < residual.sum(dim=0), vertex, solution).T
 
 
 # Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best.
@@ -234,10 +244,13 @@ def solve_iw12(
     The observations (P, F), the largest of each pixel 1, and the unit light directions (F, 3) or (P, F, 3) are float64.
     See lit_observations for `valid` and `shadow_share`; 0 keeps all observations.
     """
-    lit = lit_observations(observations, shadow_share, valid).to(observations.dtype)
-    variance = torch.ones_like(observations)
+    lit = lit_observations(observations, shadow_share, valid).to(observations.dtype).T.contiguous()
+    observed, products = observations.T.contiguous(), _products(light_directions)
+    # The diagonal of L C L' as sums of the entries of C
+    shares = products * products.new_tensor((1.0, 1.0, 1.0, 2.0, 2.0, 2.0))
+    variance = torch.ones_like(observed)
     for _ in range(iterations):
-        scaled_normals, uncertainty = weighted_least_squares(observations, light_directions, lit / variance)
-        error = observations - dot(scaled_normals, light_directions)
-        variance = (error.square() + uncertainty).clamp(min=SMALLEST_VARIANCE)
-    return scaled_normals
+        solution, covariance = _solve(observed, light_directions, lit / variance, products)
+        error = observed - _dot(light_directions, solution)
+        variance = (error.square() + _dot(shares, covariance)).clamp(min=SMALLEST_VARIANCE)
+    return solution.T

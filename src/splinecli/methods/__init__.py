@@ -95,7 +95,6 @@ def _network(
         kind, fitting = ("CNN-PS", "cnn-ps") if interpolates else ("SPLINE-Net", "spline-net")
         problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
         raise ModelError(problem, hint=f"Use them with --method {fitting}")
-    batch_size = {"cpu": 256, "cuda": 1024}[device.type]  # a processor computes a batch on each core
     return NetworkEstimator(
         name,
         loaded,
@@ -103,7 +102,7 @@ def _network(
         precision=choose_precision(options.precision, device),
         refines=refines,
         rotations=rotations if options.rotations is None else options.rotations,
-        batch_size=batch_size if options.batch_size is None else options.batch_size,
+        batch_size=1024 if options.batch_size is None else options.batch_size,
     )
 
 
