@@ -149,17 +149,24 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
         solved: Tensor = weighted_sum(values, light_directions)[:, None] @ covariance
         return solved[:, 0]
 
-    scaled = solve(observations)
+    def compare(values: Tensor) -> Tensor:
+        scaled = solve(values)
+        signed = (values - dot(scaled, light_directions)) * signs
+        return torch.cat((scaled, solve(signed), signed.sum(dim=-1, keepdim=True)), dim=1)
+
+    shared = light_directions.ndim == 2
+    # It is linear, and so one matrix if all pixels have the same lights.
+    found = observations @ compare(torch.eye(len(signs)).to(gram)) if shared else compare(observations)
+    scaled, change, difference = torch.split(found, [3, 3, 1], dim=1)
     albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
     normals = scaled / albedo
-    signed = (observations - dot(scaled, light_directions)) * signs
     # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest measures noise.
-    signs = signs.to(scaled).expand(1 if light_directions.ndim == 2 else len(scaled), -1)
+    signs = signs.to(scaled).expand(1 if shared else len(scaled), -1)
     seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
     along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
     across = covariance.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None] - along
-    noise = signed.sum(dim=-1, keepdim=True) / seeing.clamp(min=_TINY) * across.clamp(min=0).sqrt()
-    return TwoHalves(normals, solve(signed) / albedo, noise / albedo)
+    noise = difference / seeing.clamp(min=_TINY) * across.clamp(min=0).sqrt()
+    return TwoHalves(normals, change / albedo, noise / albedo)
 
 
 def alternating_signs(light_directions: Tensor) -> Tensor:

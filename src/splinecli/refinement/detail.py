@@ -62,7 +62,7 @@ class HalfCapture:
             if not len(rows):
                 return
             observations = lighting_at(rows).observations
-            largest = observations.max(axis=1, keepdims=True)
+            largest = torch.from_numpy(observations).amax(dim=1, keepdim=True).numpy()
             equal = np.where(largest > 0, np.float32(1), np.float32(_DARK))
             # In a block, the observations depend mostly on the normals of its brightest pixels.
             weights = np.maximum(largest, np.float32(_DARK * reference))
