@@ -73,6 +73,9 @@ class BatchedEstimator(Estimator):
         )
 
 
+_FEWEST_BATCHES, _FEWEST_AT_ONCE = 8, 256  # pixels; smaller batches take more time for each pixel
+
+
 def estimate_in_batches(
     solve: Solve,
     observations: Observations,
@@ -91,9 +94,11 @@ def estimate_in_batches(
     3). `progress` is called after each batch with the number of its pixels.
     """
     results = np.empty((len(observations), columns), np.float32)
+    # Few pixels make several smaller batches, whatever the number of cores, so that no core waits for another.
+    size = min(batch_size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
 
     def solve_batch(start: int) -> int:
-        rows = slice(start, start + batch_size)
+        rows = slice(start, start + size)
         batch = torch.as_tensor(observations[rows]).to(device, dtype)
         lights = torch.as_tensor(directions_at(light_directions, rows), dtype=dtype, device=device)
         solved = solve(batch, lights)
@@ -101,7 +106,7 @@ def estimate_in_batches(
         results[rows] = solved.cpu().numpy()
         return len(batch)
 
-    for count in side_by_side(solve_batch, range(0, len(observations), batch_size)):
+    for count in side_by_side(solve_batch, range(0, len(observations), size)):
         progress(count)
     return results
 
