@@ -105,7 +105,7 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
     free = torch.ones_like(linear, dtype=torch.bool)
     fewest_wrong = linear.new_full((count,), size + 1)
     patience = linear.new_full((count,), 3)
-    x = torch.zeros_like(linear)
+    found, left = torch.zeros_like(linear), torch.arange(count, device=hessian.device)
     for _ in range(100):
         system = torch.where(free[:, :, None] & free[:, None, :], hessian, eye)
         right_side = torch.where(free, linear, 0)[..., None]
@@ -114,13 +114,18 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
         value = torch.where(free, x, gradient)
         scale = torch.where(free, x.abs().amax(dim=1, keepdim=True), linear.abs().amax(dim=1, keepdim=True))
         wrong = value < -tolerance * scale
+        found[left] = torch.where(free, x, 0)
         wrong_count = wrong.sum(dim=1)
-        if not wrong_count.any():
-            break
         fewer = wrong_count < fewest_wrong
         fewest_wrong = torch.where(fewer, wrong_count, fewest_wrong)
         patience = torch.where(fewer, 3, patience - 1)
         # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last, which cannot.
         last = torch.where(wrong, position, -1).amax(dim=1, keepdim=True)
         free = free ^ torch.where(patience[:, None] < 0, wrong & (position == last), wrong)
-    return torch.where(free, x, 0).clamp(min=0)
+        rest = torch.nonzero(wrong_count)[:, 0]  # most pixels are done after a few steps
+        if not len(rest):
+            break
+        hessian, linear, free, fewest_wrong, patience, left = (
+            values[rest] for values in (hessian, linear, free, fewest_wrong, patience, left)
+        )
+    return found.clamp(min=0)

@@ -1,7 +1,7 @@
 """LI-Net and NE-Net, their layers, and the heads that estimate the errors of normals."""
 
 import math
-from collections.abc import Sequence
+from functools import cache
 from typing import TypeVar
 
 import torch
@@ -50,14 +50,15 @@ _OF_WEIGHTS = ((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 
 _OF_PRODUCTS = ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
 
 
-def _in_both_directions(transform: Sequence[Sequence[float]], like: Tensor) -> Tensor:
-    matrix = torch.tensor(transform, dtype=like.dtype, device=like.device)
+@cache
+def _in_both_directions(transform: tuple[tuple[float, ...], ...]) -> Tensor:
+    matrix = torch.tensor(transform, dtype=torch.float32)
     return torch.kron(matrix, matrix)
 
 
 def winograd_weights(weight: Tensor) -> Tensor:
     """Return the transformed weights (36, C, D) of a convolution (D, C, 3, 3)."""
-    transform = _in_both_directions(_OF_WEIGHTS, weight) / 24**2
+    transform = _in_both_directions(_OF_WEIGHTS) / 24**2
     return (transform @ weight.permute(2, 3, 1, 0).reshape(9, -1)).view(-1, *weight.shape[1::-1])
 
 
@@ -67,11 +68,11 @@ def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor
     It takes 36 products for the 144 of a convolution, and each transform is one product of matrices.
     """
     _, n_maps, width = x.shape
-    values = (_in_both_directions(_OF_VALUES, x) @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
+    values = (_in_both_directions(_OF_VALUES) @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
     products = torch.bmm(values, transformed)
     if bias is not None:
         products[7] += bias  # the transform adds this product to all positions, with a factor of 1
-    return (_in_both_directions(_OF_PRODUCTS, x) @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
+    return (_in_both_directions(_OF_PRODUCTS) @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
 
 
 def is_float32(values: Tensor) -> bool:
