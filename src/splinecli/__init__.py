@@ -144,7 +144,7 @@ def estimate_normals(
     estimator = make_estimator(method, options)
     given = None if light_intensities is None else np.asarray(light_intensities, np.float64)
     check = partial(check_arrays, intensities=given)
-    estimate, _ = estimate_capture(capture, estimator, check, distil=distil, progress=progress)
+    estimate, _ = estimate_capture(capture, lambda: estimator, check, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
         if warning.is_error:
             warn(str(warning), stacklevel=2)

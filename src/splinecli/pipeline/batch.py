@@ -23,12 +23,20 @@ from splinecli.methods import Estimator, MethodOptions, method_names
 from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import BASE_BYTES, held_results, infer_capture, inputs_sha256, make_method, source_bytes
+from splinecli.pipeline.infer import (
+    BASE_BYTES,
+    held_results,
+    infer_capture,
+    inputs_sha256,
+    make_method,
+    may_be_refused,
+    source_bytes,
+)
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import NoRoomError, as_splinecli_error, check_writable, find_mode, resolve, write_text
-from splinecli.system.machine import available_memory, choose_device, count_available_cores, is_out_of_memory
+from splinecli.system.machine import available_memory, choose_device, count_available_cores, is_out_of_memory, meanwhile
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, is_plain
 
@@ -130,11 +138,14 @@ def run_member(
             return failed(member.name, error, status="changed")
     except Exception as error:
         return _failure(member, error)
-    estimator = method()
-    try:
-        return Outcome("done", infer_capture(member.folder, options, observer, estimator=estimator))
-    except Exception as error:
-        return _failure(member, error)
+    if may_be_refused(options):
+        method()
+    with meanwhile(method) as load:  # PyTorch takes a second or two, in which images are read
+        try:
+            return Outcome("done", infer_capture(member.folder, options, observer, load=load))
+        except Exception as error:
+            load()
+            return _failure(member, error)
 
 
 def _failure(member: BatchItem, error: Exception) -> Outcome:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import draw_lights
 from splinecli.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.lights.light_fit import refine_capture
-from splinecli.methods import Estimator, make_estimator
+from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
 from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
 from splinecli.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
 from splinecli.pictures.maps import encode_png
@@ -134,7 +134,7 @@ def distil_for(
 
 def estimate_capture(
     capture: Capture,
-    estimator: Estimator,
+    load: Callable[[], Estimator],
     check: Callable[[Capture], list[CaptureWarning]],
     *,
     refine_lights: Callable[[Capture], Capture] | None = None,
@@ -146,9 +146,9 @@ def estimate_capture(
     """Return the normals of a capture, with all warnings added to it, and the distilled estimator if one was used.
 
     The capture already contains the warnings from reading it. `check` returns the warnings about its lights and images
-    (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
-    is called with the number of pixels just estimated. With `strict`, a warning that an input is probably wrong becomes
-    an InputError. The clock times the stages and shows them.
+    (diagnosis/checks.py), then `load` the estimator, and `refine_lights` the capture with refined lights. `distil` is
+    as in distil_for. `progress` is called with the number of pixels just estimated. With `strict`, a warning that an
+    input is probably wrong becomes an InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")
@@ -161,6 +161,7 @@ def estimate_capture(
         warnings += capture.warnings[before:]
     capture = replace(capture, warnings=tuple(warnings))
     capture = find_surface(capture)
+    estimator = load()
     distilled, found = distil_for(capture, estimator, distil, clock)
     advance = clock.begin("estimate", capture.n_pixels, "estimating")
     estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, clock=clock)
@@ -174,7 +175,7 @@ def estimate_capture(
 
 
 def infer_capture(
-    folder: Path, options: InferOptions, observer: Observer = SILENT, *, estimator: Estimator | None = None
+    folder: Path, options: InferOptions, observer: Observer = SILENT, *, load: Callable[[], Estimator] | None = None
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
@@ -182,7 +183,8 @@ def infer_capture(
     process may write there in the meantime.
 
     Args:
-        estimator: the result of `make_method(options)`, which can be reused in a batch to save time.
+        load: returns `make_method(options)`, which can be reused in a batch to save time. It is called once the capture
+            has been read and checked.
 
     Raises:
         InputError: the capture cannot be read, or with options.strict, its lights or images are probably wrong.
@@ -203,13 +205,13 @@ def infer_capture(
         clock = Clock(show)
         if options.finds_lights:
             _check_light_files(target)
-        estimator = estimator or make_method(options)
-        source, capture = _read(folder, options, estimator.has_confidence, clock)
+        load = load or cache(partial(make_method, options))
+        source, capture = _read(folder, options, clock)
         _check_results(capture, folder, options)
         refine = partial(refine_capture, intensities_known=source.intensities_known)
         estimate, distilled = estimate_capture(
             capture,
-            estimator,
+            load,
             partial(check_capture, source, strict=options.strict),
             refine_lights=refine if options.refine_lights else None,
             distil=options.distil,
@@ -219,6 +221,7 @@ def infer_capture(
         for warning in estimate.capture.warnings:
             once = warning.code if warning.kind is EIGHT_BIT else None  # usual in a batch, and of all its captures
             observer.warn(f"{capture.name}: {warning}", once=once)
+        estimator = load()
         loaded = None if estimator.weights is None else estimator.weights["sha256"]
         report = report_of(
             estimate,
@@ -269,7 +272,13 @@ def make_method(options: InferOptions) -> Estimator:
     return estimator
 
 
-def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> tuple[CaptureSource, Capture]:
+def may_be_refused(options: InferOptions) -> bool:
+    """Return whether make_method may raise an error, which has to be reported before a capture is read."""
+    unlike = replace(options.method_options, precision="auto") != MethodOptions()
+    return options.method != DEFAULT_METHOD or unlike
+
+
+def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSource, Capture]:
     source = options.open(folder)
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
@@ -278,7 +287,12 @@ def _read(folder: Path, options: InferOptions, network: bool, clock: Clock) -> t
     height, width, *_ = source.facts[0].size[0]
     maps = chosen_maps(options.maps, page=options.html)
     seconds = partial(
-        expected_seconds, n_images=count, image_pixels=height * width, network=network, align=options.align, maps=maps
+        expected_seconds,
+        n_images=count,
+        image_pixels=height * width,
+        network=options.method.startswith(DEFAULT_METHOD),
+        align=options.align,
+        maps=maps,
     )
     clock.expect(seconds(height * width, distils=options.distil))
     for_mask = source.n_lights * options.auto_mask  # images that are read to find the object, also after aligning

@@ -297,6 +297,13 @@ def in_order(
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Start function() on another thread, and yield a callable that waits for its result or raises its error."""
+    with ThreadPoolExecutor(1, "meanwhile") as pool:
+        yield pool.submit(function).result
+
+
 def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
     """Yield function(part) of each part as in_order does, without gradients, on as many threads as PyTorch uses.
 
