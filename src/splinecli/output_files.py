@@ -39,6 +39,7 @@ class OutputMap:
     caption: below the picture on the page, which shows this map even if --maps does not name it; "" leaves it out.
     needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
     bytes_per_pixel, bytes_per_observation: memory. Maps that need any are computed before the others are written.
+    seconds, seconds_per_pixel: the expected time of a map that takes long, without reading the images.
     fewest_lights: number of lights below which the map is refused.
     parts: if the map is written as several maps, their names, channels and pictures instead of the above.
     """
@@ -56,6 +57,8 @@ class OutputMap:
     reads_images: bool = False
     bytes_per_pixel: int = 0
     bytes_per_observation: int = 0
+    seconds: float = 0.0
+    seconds_per_pixel: float = 0.0
     fewest_lights: int = 0
     parts: "tuple[MapPart, ...]" = ()
 
@@ -134,6 +137,8 @@ _ROWS = (
         reads_images=True,
         bytes_per_pixel=170,  # the maps, and the gloss of each pixel
         bytes_per_observation=5,
+        seconds=2.5,
+        seconds_per_pixel=1e-5,
         fewest_lights=4,
         parts=(
             MapPart("base_colour", 0, 3, "splinecli.results.material:base_colour_picture"),

@@ -32,12 +32,11 @@ class _Costs(NamedTuple):
     write: float  # per pixel
 
 
-_BFLOAT16 = _Costs(1.4e-7, 1.3e-4, 1.0e-6, 3.0e-5, 7e-7, 1.6e-3, 3e-7)
-_FLOAT32 = _Costs(1.8e-7, 4.0e-4, 2.2e-6, 9.0e-5, 1.3e-6, 2.0e-3, 3e-7)  # AVX2
+_BFLOAT16 = _Costs(1.7e-7, 1.2e-4, 1.1e-6, 3.0e-5, 1.4e-6, 0.9e-3, 2e-7)
+_FLOAT32 = _Costs(1.9e-7, 2.5e-4, 1.8e-6, 7.0e-5, 1.7e-6, 1.2e-3, 2e-7)  # AVX2
 _OTHER_METHODS = 4e-5  # per pixel
 _UNLIKE = 0.005  # share of pixels that the network estimates beside a distilled estimator
 _INDIRECT = 0.3  # share of the pixels that are usually estimated again
-_MATERIAL, _MATERIAL_PIXEL = 2.5, 1e-5  # plus this for each pixel
 _ALIGN, _ALIGN_ROOT = 1.0, 7e-3  # plus this times the square root of the values of all images
 
 
@@ -65,7 +64,7 @@ def expected_seconds(
     costs = _BFLOAT16 if _has_bfloat16() else _FLOAT32
     read = costs.read * image_pixels * n_images / min(cores, 2)
     pictures = read * any(row.reads_images for row in maps)
-    pictures += (_MATERIAL + _MATERIAL_PIXEL * n_pixels) * any(row.name == "material" for row in maps)
+    pictures += sum(row.seconds + row.seconds_per_pixel * n_pixels for row in maps)
     found = {"read": read, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
     if align:
         found["read"] += read + _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
