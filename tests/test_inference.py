@@ -5,8 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.inference import estimate_normals
-from splinecli.methods.estimator import LeastSquares
+from splinecli.inference import estimate_normals, estimate_pixels
+from splinecli.lights.lighting import PixelLighting
+from splinecli.methods.estimator import TILE_PIXELS, LeastSquares
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
@@ -49,3 +50,27 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
     assert sum(done) == n_pixels
     assert len(done) == -(-n_pixels // tile_pixels)
     assert max(done) <= tile_pixels
+
+
+@pytest.mark.parametrize(("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)])
+def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most) -> None:
+    """Under near lamps, every pixel has its own directions, which would take gigabytes."""
+    asked = []
+
+    class Counting(LeastSquares):
+        tile_pixels = 1 << 20
+
+        def estimate(self, observations, light_directions, **options):
+            asked.append(len(observations))
+            return np.tile(np.float32((0, 0, 1)), (len(observations), 1))
+
+    mask = np.ones((1, 400_000), np.bool_)
+    directions = np.broadcast_to(np.float32((0, 0, 1)), (mask.size, n_lights, 3))
+
+    def lighting(_, pixels):
+        return PixelLighting(observations[pixels], directions[pixels] if near else directions[0])
+
+    observations = np.ones((mask.size, n_lights), np.float32)
+    estimate_pixels(mask, observations, lighting, Counting())
+    assert TILE_PIXELS <= max(asked) <= most
+    assert sum(asked) == mask.size

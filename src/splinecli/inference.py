@@ -158,6 +158,9 @@ def _estimate(
     return normals, errors, judged
 
 
+_TILE_VALUES = 1 << 24  # the most numbers, observations and directions, that an estimator gets at once
+
+
 class PixelEstimates(NamedTuple):
     """The results of an estimator, before refinement.
 
@@ -200,7 +203,10 @@ def estimate_pixels(
         normals[pixels] = light.in_frame_of_capture(found)
 
     lighting_at = partial(lighting_without, None)
-    refiner, tile_pixels = estimator.refiner, estimator.tile_pixels
+    refiner = estimator.refiner
+    # Directions that differ from pixel to pixel are computed in float64.
+    each = 1 if lighting_at(np.arange(1)).directions.ndim == 2 else 10
+    tile_pixels = min(estimator.tile_pixels, max(TILE_PIXELS, _TILE_VALUES // (each * observations.shape[1])))
     estimator = estimator.bind(lighting_at, n_pixels)
     for pixels in parts_of_pixels(n_pixels, tile_pixels):
         estimate(pixels, lighting_at(pixels), progress)

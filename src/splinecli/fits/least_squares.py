@@ -64,8 +64,8 @@ def _products(light_directions: Tensor) -> Tensor:
     return torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
 
 
-# Rows are lights and columns pixels here: sums over lights, and operations on matrices of 3 x 3, then run along the
-# pixels, three times as fast.
+# In the next three functions, rows are lights and columns pixels: sums over lights, and operations on matrices of
+# 3 x 3, then run along the pixels, three times as fast.
 
 
 def _solve(observed: Tensor, light_directions: Tensor, weight: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:

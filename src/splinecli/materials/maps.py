@@ -279,6 +279,7 @@ def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float3
 def _exposure(base: Float32Array, gloss: Gloss) -> float:
     """Return the exposure at which dielectrics reflect as they usually do and no base exceeds white."""
     white = max(float(np.quantile(base.max(axis=1), _WHITE_QUANTILE)), 1e-9)
-    dielectric = 1 - gloss.metalness
-    mean = float(dielectric @ gloss.log_level.exp()) / max(float(dielectric.sum()), 1e-9)
+    # In NumPy, because sums of PyTorch depend on the number of threads.
+    dielectric, level = 1 - gloss.metalness.numpy(), gloss.log_level.exp().numpy()
+    mean = float((dielectric * level).sum(dtype=np.float64)) / max(float(dielectric.sum(dtype=np.float64)), 1e-9)
     return float(np.clip(mean / _DIELECTRIC, white, _MOST_EXPOSURE * white))

@@ -22,7 +22,7 @@ class MethodOptions:
 
     weights: str | None = None  # a shipped name or a file
     rotations: int | None = None  # number of rotations of the lights whose normals a network averages
-    batch_size: int | None = None  # pixels per batch. A processor computes a batch on each core
+    batch_size: int | None = None  # most pixels per batch. A processor computes a batch on each core
     device: Device = "auto"  # where to compute; "auto" is a CUDA GPU if there is one
     precision: Precision = "auto"  # of a network; "auto" is bfloat16 if the device computes natively in it
 

@@ -94,8 +94,10 @@ def estimate_in_batches(
     3). `progress` is called after each batch with the number of its pixels.
     """
     results = np.empty((len(observations), columns), np.float32)
-    # Few pixels make several smaller batches, whatever the number of cores, so that no core waits for another.
-    size = min(batch_size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
+    size = batch_size
+    if device == "cpu":
+        # Few pixels make several smaller batches, whatever the number of cores, so that no core waits for another.
+        size = min(size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
 
     def solve_batch(start: int) -> int:
         rows = slice(start, start + size)
@@ -116,11 +118,12 @@ Precision = Literal["float32", "bfloat16"]
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 
 
-def context_sample(lighting_at: LightingAt, n_pixels: int) -> tuple[Tensor, ...]:
+def context_sample(lighting_at: LightingAt, n_pixels: int) -> tuple[Tensor, Tensor]:
     """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a capture's pixels."""
     light = lighting_at(np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp))
     pixels = sample_of(light.observations)
-    return float_tensors(light.observations[pixels], directions_at(light.directions, pixels))
+    observations, directions = float_tensors(light.observations[pixels], directions_at(light.directions, pixels))
+    return observations, directions
 
 
 def float_tensors(*arrays: Floats) -> tuple[Tensor, ...]:

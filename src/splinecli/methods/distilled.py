@@ -114,6 +114,7 @@ BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 _MOMENTUM, _SQUARES = 0.9, 0.99  # decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
+_ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 
 
@@ -176,8 +177,8 @@ class Perceptron(nn.Module):
         """Return the gradients of the loss, in the order of `parameters`.
 
         The loss is the mean angle to the normals (P, 3) of pixels with inputs (P, C), and not its square, because the
-        estimator's outliers must not draw the normals of other pixels, and 0.05 times the mean square difference from
-        their errors (P, 2). Without autograd, learning takes half of the time.
+        estimator's outliers must not draw the normals of other pixels, and _ERROR_SHARE times the mean square
+        difference from their errors (P, 2). Without autograd, learning takes half of the time.
         """
         (*weights, last), (*biases, offset) = self._weights_and_biases()
         passed = [(inputs - self.mean) / self.spread]
@@ -190,7 +191,7 @@ class Perceptron(nn.Module):
         away = unit - normals
         away /= (away.square().sum(dim=1, keepdim=True) + _ROUNDED**2).sqrt_()
         across = (away - unit * (unit * away).sum(dim=1, keepdim=True)) / length
-        change = torch.cat((across, 0.05 * (found[:, 3:] - errors)), dim=1).div_(len(inputs))
+        change = torch.cat((across, _ERROR_SHARE * (found[:, 3:] - errors)), dim=1).div_(len(inputs))
         gradients: list[Tensor] = []
         for weight, values in zip((last, *reversed(weights)), reversed(passed), strict=True):
             gradients[:0] = change.T @ values, change.sum(dim=0)
@@ -238,7 +239,7 @@ def _rate_share(done: float) -> float:
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 
-_TILE = 8192  # pixels whose hidden layers stay in a processor's cache
+_TILE = 8192  # with fewer pixels at once, two cores often wait for each other
 
 
 @dataclass(frozen=True)
@@ -263,7 +264,7 @@ class DistilledEstimator(Estimator):
 
     has_confidence = True
     tile_pixels = 1 << 20
-    """The few rare pixels of a tile still fill a batch of the network."""
+    """The few rare pixels of a tile still fill several batches of the network."""
 
     def __init__(
         self, teacher: Estimator, perceptron: Perceptron, sample: PixelSample, found: Distillation, size: StudentSize
@@ -350,7 +351,7 @@ def distil(
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
-    with torch.inference_mode(False):  # what it makes could not be learned from
+    with torch.inference_mode(False):  # tensors made in it could not be changed later
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
         # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through the network.
         rare_share = min(0.005, size.sample / n_pixels)

@@ -1,7 +1,6 @@
 """LI-Net and NE-Net, their layers, and the heads that estimate the errors of normals."""
 
 import math
-from functools import cache
 from typing import TypeVar
 
 import torch
@@ -43,23 +42,24 @@ class ResidualBlock(nn.Module):
 SIDE = 4  # patches along a side of the maps for which winograd_conv is written
 _AT_ONCE = 256  # maps whose features stay in a processor's cache
 
-# The transforms F(4, 3) of values, weights and products (Lavin and Gray, Fast algorithms for convolutional neural
-# networks, CVPR 2016, equation 13). The first and the last of six values are padding: their columns are left out.
-_OF_VALUES = ((0, -5, 0, 1), (-4, -4, 1, 1), (4, -4, -1, 1), (-2, -1, 2, 1), (2, -1, -2, 1), (4, 0, -5, 0))
-_OF_WEIGHTS = ((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24))  # divided by 24
-_OF_PRODUCTS = ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
 
-
-@cache
 def _in_both_directions(transform: tuple[tuple[float, ...], ...]) -> Tensor:
     matrix = torch.tensor(transform, dtype=torch.float32)
     return torch.kron(matrix, matrix)
 
 
+# The transforms F(4, 3) of values, weights and products (Lavin and Gray, Fast algorithms for convolutional neural
+# networks, CVPR 2016, equation 13). The first and the last of six values are padding: their columns are left out.
+_OF_VALUES = _in_both_directions(
+    ((0, -5, 0, 1), (-4, -4, 1, 1), (4, -4, -1, 1), (-2, -1, 2, 1), (2, -1, -2, 1), (4, 0, -5, 0))
+)
+_OF_WEIGHTS = _in_both_directions(((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24))) / 24**2
+_OF_PRODUCTS = _in_both_directions(((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1)))
+
+
 def winograd_weights(weight: Tensor) -> Tensor:
     """Return the transformed weights (36, C, D) of a convolution (D, C, 3, 3)."""
-    transform = _in_both_directions(_OF_WEIGHTS) / 24**2
-    return (transform @ weight.permute(2, 3, 1, 0).reshape(9, -1)).view(-1, *weight.shape[1::-1])
+    return (_OF_WEIGHTS @ weight.permute(2, 3, 1, 0).reshape(9, -1)).view(-1, *weight.shape[1::-1])
 
 
 def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor:
@@ -68,11 +68,11 @@ def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor
     It takes 36 products for the 144 of a convolution, and each transform is one product of matrices.
     """
     _, n_maps, width = x.shape
-    values = (_in_both_directions(_OF_VALUES) @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
+    values = (_OF_VALUES @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
     products = torch.bmm(values, transformed)
     if bias is not None:
         products[7] += bias  # the transform adds this product to all positions, with a factor of 1
-    return (_in_both_directions(_OF_PRODUCTS) @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
+    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
 
 
 def is_float32(values: Tensor) -> bool:

@@ -28,8 +28,8 @@ from splinecli.pipeline.infer import (
     held_results,
     infer_capture,
     inputs_sha256,
+    loads_first,
     make_method,
-    may_be_refused,
     source_bytes,
 )
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
@@ -138,13 +138,13 @@ def run_member(
             return failed(member.name, error, status="changed")
     except Exception as error:
         return _failure(member, error)
-    if may_be_refused(options):
+    if loads_first(options):
         method()
     with meanwhile(method) as load:  # PyTorch takes a second or two, in which images are read
         try:
             return Outcome("done", infer_capture(member.folder, options, observer, load=load))
         except Exception as error:
-            load()
+            load()  # if the method cannot be loaded, this is said instead
             return _failure(member, error)
 
 

@@ -272,10 +272,14 @@ def make_method(options: InferOptions) -> Estimator:
     return estimator
 
 
-def may_be_refused(options: InferOptions) -> bool:
-    """Return whether make_method may raise an error, which has to be reported before a capture is read."""
-    unlike = replace(options.method_options, precision="auto") != MethodOptions()
-    return options.method != DEFAULT_METHOD or unlike
+def loads_first(options: InferOptions) -> bool:
+    """Return whether the method has to be loaded before a capture is read.
+
+    Its options may be wrong, except for the precision, or the light directions are found in PyTorch, whose number of
+    threads loading sets.
+    """
+    chosen = replace(options.method_options, precision="auto") != MethodOptions()
+    return chosen or options.method != DEFAULT_METHOD or options.finds_lights
 
 
 def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSource, Capture]:
