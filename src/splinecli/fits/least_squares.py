@@ -54,11 +54,11 @@ def weighted_least_squares(observations: Tensor, light_directions: Tensor, weigh
     Observations and weights are (P, F), and light directions (F, 3) or (P, F, 3). All are float64, because weights may
     differ by many orders of magnitude.
     """
-    solution, covariance = _solve(observations.T, light_directions, weight.T, _products(light_directions))
+    solution, covariance = _solve(observations.T, light_directions, weight.T, direction_products(light_directions))
     return solution.T, covariance
 
 
-def _products(light_directions: Tensor) -> Tensor:
+def direction_products(light_directions: Tensor) -> Tensor:
     """Return xx, yy, zz, xy, xz, yz of light directions (F, 3) or (P, F, 3), on the last axis."""
     x, y, z = light_directions.unbind(-1)
     return torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
@@ -106,7 +106,7 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
     lit = torch.where(observed < SHADOW_SHARE, 1e-3, 1.0).to(observed)
     if valid is not None:
         lit = lit * valid.T
-    products = _products(light_directions)
+    products = direction_products(light_directions)
     # A weak prior towards the last solution keeps pixels with fewer than three lit lights solvable.
     prior = observed.new_tensor((_PRIOR,) * 3 + (0.0,) * 3)[:, None]
     solution = observed.new_tensor((0.0, 0.0, 1e-3))[:, None].expand(3, len(observations))
@@ -209,7 +209,7 @@ def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     Iteratively reweighted least squares comes close to the minimum, where three residuals are zero. So the b that
     makes the three smallest residuals zero is used if it is better.
     """
-    observed, products = observations.T.contiguous(), _products(light_directions)
+    observed, products = observations.T.contiguous(), direction_products(light_directions)
 
     def fit(weight: Tensor) -> tuple[Tensor, Tensor]:
         solution, _ = _solve(observed, light_directions, weight, products)
@@ -252,7 +252,7 @@ def solve_iw12(
     See lit_observations for `valid` and `shadow_share`; 0 keeps all observations.
     """
     lit = lit_observations(observations, shadow_share, valid).to(observations.dtype).T.contiguous()
-    observed, products = observations.T.contiguous(), _products(light_directions)
+    observed, products = observations.T.contiguous(), direction_products(light_directions)
     # The diagonal of L C L' as sums of the entries of C
     shares = products * products.new_tensor((1.0, 1.0, 1.0, 2.0, 2.0, 2.0))
     variance = torch.ones_like(observed)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from splinecli.fits.least_squares import weighted_sum
+from splinecli.fits.least_squares import direction_products, weighted_sum
 from splinecli.fits.robust import inverse_3x3, lit_values, multiply_symmetric
 from splinecli.networks.config import HEAD_WIDTH
 from splinecli.networks.li_ne_net import zeroed
@@ -206,10 +206,8 @@ class _AttentionLayer(nn.Module):
 def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor:
     """Return the unit normals (P, 3) of weighted least squares, l . b = target."""
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
-    x, y, z = lights.unbind(-1)
     prior = lights.new_tensor((_PRIOR, _PRIOR, _PRIOR, 0, 0, 0))
-    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
-    matrix = weighted_sum(weight, products) + prior
+    matrix = weighted_sum(weight, direction_products(lights)) + prior
     # If otherwise undetermined, the normal points to the camera.
     vector = weighted_sum(weight * targets, lights) + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
     scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
