@@ -351,7 +351,7 @@ def distil(
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
-    with torch.inference_mode(False):  # tensors made in it could not be changed later
+    with torch.inference_mode(False):  # its tensors could not be changed in place outside of it
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
         # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through the network.
         rare_share = min(0.005, size.sample / n_pixels)
