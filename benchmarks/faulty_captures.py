@@ -1,16 +1,20 @@
 """Render captures, right and faulty ones, and estimate them: examples for benchmarks/fit_capture_confidence.py.
 
-    python benchmarks/faulty_captures.py FOLDER [--scenes 420] [--size 64] [--part 1/2]
+    python benchmarks/faulty_captures.py FOLDER [--scenes 420] [--size 64] [--part 1/2] [--sets SET ...]
 
-Each scene becomes three captures of KINDS: right ones, and ones whose lamps or files are not what they are taken for.
-spline-net estimates them. FOLDER keeps each with its true errors in a file. A run continues an earlier one; --part I/N
-takes every N-th scene, so that N processes can share the work.
+Half of the scenes are rendered here; the others are whole scenes of pixel sets of `splinecli prepare`, which have more
+pixels and more detail. Without --sets, all are rendered here. Each scene becomes three captures of KINDS: right ones,
+and ones whose lamps or files are not what they are taken for. spline-net estimates them. FOLDER keeps each with its
+true errors in a file. A run continues an earlier one; --part I/N takes every N-th scene, so that N processes can share
+the work.
 """
 
 import argparse
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +29,11 @@ from splinecli.lights.lighting import LightingAt
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
+from splinecli.pixel_sets.store import PixelSet, open_pixel_set
 from splinecli.refinement.refiner import NetworkRefiner
+from splinecli.restoration.lens_blur import REACH
 from splinecli.synthesis.batches import CaptureConfig
+from splinecli.synthesis.lights import choose_in_cone
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -132,9 +139,21 @@ def bend_values(values: Floats, rng: np.random.Generator) -> Floats:
     return values ** (1 / gamma if rng.random() < 0.65 else gamma)
 
 
-def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
-    """Render scene number `index` as some captures, with true normals (P, 3), zero where nothing is to be seen."""
-    rng, generator = np.random.default_rng([SEED, index]), torch.Generator().manual_seed(1000 * SEED + index)
+class Scene(NamedTuple):
+    """A scene under the lights of one capture."""
+
+    radiance: torch.Tensor  # (P, F)
+    mask: NDArray[np.bool_]  # (H, W)
+    normals: Floats  # (P, 3)
+    lights: Floats  # (F, 3), unit
+    number: int  # the same for all captures of a shape
+    lamps: NearLamps | None = None  # the true lamps, if they are near
+
+
+def render_scenes(
+    index: int, size: int, kinds: Sequence[str], rng: np.random.Generator, generator: torch.Generator
+) -> list[Scene]:
+    """Render one shape for captures of these kinds, with its own material and lights for each."""
     size = round(size * rng.uniform(0.8, 1.2) / 8) * 8
     mesh = draw_mesh(rng)
     tracer = Tracer(mesh)
@@ -142,15 +161,14 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
     if len(visible.normals) < size**2 / 8:
         return []
     made = []
-    for _ in range(CAPTURES_PER_SCENE):
-        kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+    for kind in kinds:
         patches = int(3000 ** rng.random())
         material = draw_material(patches, generator)
         materials = {"one": with_one_gloss(material) if rng.random() < 0.5 else material}
         parts = materials, draw_patches(mesh, patches, rng)
         lights = draw_lights(rng)
         single = lights.astype(np.float32)
-        positions = None
+        lamps = None
         if kind == "near lamps" or (kind == "right" and rng.random() < 0.1):
             # Widths of the object from its mean plane. All lamps are equally strong, or measured at the origin.
             middle = np.array((0, 0, visible.samples.position[:, 2].mean()))
@@ -158,18 +176,53 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
             radiance = render_point_lights(tracer, visible, positions + middle, *parts)["one"]
             fall = np.sum((positions + middle) ** 2, axis=1) / np.sum(positions**2, axis=1)
             radiance /= torch.from_numpy(fall)
+            lamps = NearLamps.of(positions, 2 / size, (size, size), equal=False)
         else:
             radiance = render_direct(tracer, visible, single, *parts)["one"]
         if rng.random() < 0.65:
             more = {"directions": 48, "bounces": 3, "generator": generator}
             with torch.inference_mode():
                 radiance = radiance + render_indirect(tracer, visible, single, *parts, **more)["one"]
-        mask, normals = visible.mask, visible.normals
+        made.append(Scene(radiance, visible.mask, visible.normals, lights, index, lamps))
+    return made
+
+
+def stored_scene(pixel_set: PixelSet, rng: np.random.Generator, generator: torch.Generator) -> Scene:
+    """Choose a scene of a pixel set, and 5 to 60 of its lights."""
+    entry = pixel_set.entries[rng.integers(len(pixel_set.entries))]
+    pixels = pixel_set.load(entry)
+    count = 10 if rng.random() < 0.3 else round(5 * 12 ** rng.random())
+    chosen = choose_in_cone(torch.from_numpy(np.array(pixels.light_directions)), count, generator).numpy()
+    radiance = torch.from_numpy(np.asarray(pixels.observations[:, chosen], np.float32))
+    lights = np.asarray(pixels.light_directions, np.float64)[chosen]
+    normals = np.asarray(pixels.normals, np.float32)
+    return Scene(radiance, np.array(pixels.mask), normals, lights, zlib.crc32(entry.scene.encode()))
+
+
+def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple[Capture, Floats, int]]:
+    """Make scene number `index` into some captures, with true normals (P, 3), zero where nothing is to be seen.
+
+    The last item is the number of the scene, by which the fit tells scenes that it has not used.
+
+    Half of the scenes are of the pixel sets, if there are any, and have no near lamps.
+    """
+    rng, generator = np.random.default_rng([SEED, index]), torch.Generator().manual_seed(1000 * SEED + index)
+    kinds = [str(kind) for kind in rng.choice(list(KINDS), CAPTURES_PER_SCENE, p=list(KINDS.values()))]
+    if sets and index % 2:
+        kinds = ["right" if kind == "near lamps" else kind for kind in kinds]
+        scenes = [stored_scene(sets[rng.integers(len(sets))], rng, generator) for _ in kinds]
+    else:
+        scenes = render_scenes(index, size, kinds, rng, generator)
+    made = []
+    for kind, (radiance, mask, normals, lights, scene, lamps) in zip(kinds, scenes, strict=bool(scenes)):
+        single = lights.astype(np.float32)
+        if lamps is None:  # whose places depend on the size of the images
+            mask = np.pad(mask, REACH)  # a dark margin, which a lens and its inverse filter mix with the outline
         if kind == "no mask":
             margin = [(int(rng.integers(16)),) * 2] * 2
             mask = np.pad(mask, margin)
-            normals = np.zeros((mask.size, 3), np.float32)
-            normals[mask.ravel()] = visible.normals
+            own, normals = normals, np.zeros((mask.size, 3), np.float32)
+            normals[mask.ravel()] = own
             felt = 10 ** rng.uniform(-4, -1.5) * rng.uniform(0.5, 1.5, (mask.size, 1)) * rng.choice((0, 1))
             shown = (felt * lights[:, 2] * float(radiance.mean())).astype(np.float32)
             shown[mask.ravel()] = radiance
@@ -200,10 +253,9 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
         if in_one_plane(stated):
             continue
         capture = Capture(kind, observations, stated, tuple(range(len(lights))), mask)
-        if positions is not None and kind == "right":
-            lamps = NearLamps.of(positions, 2 / size, (size, size), equal=False)
+        if lamps is not None and kind == "right":
             capture = replace(capture, lamps=lamps)
-        made.append((capture, normals))
+        made.append((capture, normals, scene))
     return made
 
 
@@ -225,7 +277,7 @@ class Recorder:
         }  # fmt: skip
 
 
-def store_captures(folder: Path, scenes: Sequence[int], size: int) -> None:
+def store_captures(folder: Path, scenes: Sequence[int], size: int, sets: Sequence[PixelSet]) -> None:
     torch.set_num_threads(1)
     estimator = make_estimator("spline-net")
     recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[assignment,arg-type]
@@ -233,7 +285,7 @@ def store_captures(folder: Path, scenes: Sequence[int], size: int) -> None:
         if (folder / f"{index:05d}.done").exists():
             continue
         rng = np.random.default_rng(index)
-        for number, (capture, normals) in enumerate(make_captures(index, size)):
+        for number, (capture, normals, scene) in enumerate(make_captures(index, size, sets)):
             estimate_normals(capture, estimator)
             truth = normals.astype(np.float64)
             unknown = ~truth.any(axis=1)
@@ -244,7 +296,7 @@ def store_captures(folder: Path, scenes: Sequence[int], size: int) -> None:
                 for name in ("", "pixelwise_")
             }
             np.savez(
-                folder / f"{index:05d}_{number}.npz", **recorder.seen, kind=capture.name, scene=index,
+                folder / f"{index:05d}_{number}.npz", **recorder.seen, kind=capture.name, scene=scene,
                 known=~unknown, error_deg=found[""], pixelwise_error_deg=found["pixelwise_"],
                 lights=capture.light_directions,
             )  # fmt: skip
@@ -257,10 +309,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", type=int, default=420)
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--part", default="1/1")
+    parser.add_argument("--sets", type=Path, nargs="*", default=[])
     options = parser.parse_args(arguments)
     part, parts = map(int, options.part.split("/"))
     options.folder.mkdir(exist_ok=True)
-    store_captures(options.folder, range(part - 1, options.scenes, parts), options.size)
+    sets = [open_pixel_set(folder) for folder in options.sets]
+    store_captures(options.folder, range(part - 1, options.scenes, parts), options.size, sets)
     print(f"{len(list(options.folder.glob('*.npz')))} captures")
 
 
