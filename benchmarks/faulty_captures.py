@@ -87,9 +87,14 @@ def draw_mesh(rng: np.random.Generator) -> Mesh:
     return turn(mesh, draw_rotation(rng)) if kind < 0.7 else mesh
 
 
+def draw_count(rng: np.random.Generator) -> int:
+    """Draw a number of lights: 10, or 5 to 60."""
+    return 10 if rng.random() < 0.3 else round(5 * 12 ** rng.random())
+
+
 def draw_lights(rng: np.random.Generator) -> Floats:
     """Draw 5 to 60 light directions (F, 3): within a cone, or as a ring with one or more tilts."""
-    count = 10 if rng.random() < 0.3 else round(5 * 12 ** rng.random())
+    count = draw_count(rng)
     lowest = rng.uniform(0.15, 0.75)
     while True:
         z, azimuth = rng.uniform(lowest, 0.98, count), rng.uniform(0, 2 * np.pi, count)
@@ -191,8 +196,8 @@ def stored_scene(pixel_set: PixelSet, rng: np.random.Generator, generator: torch
     """Choose a scene of a pixel set, and 5 to 60 of its lights."""
     entry = pixel_set.entries[rng.integers(len(pixel_set.entries))]
     pixels = pixel_set.load(entry)
-    count = 10 if rng.random() < 0.3 else round(5 * 12 ** rng.random())
-    chosen = choose_in_cone(torch.from_numpy(np.array(pixels.light_directions)), count, generator).numpy()
+    directions = torch.from_numpy(np.array(pixels.light_directions))
+    chosen = choose_in_cone(directions, draw_count(rng), generator).numpy()
     radiance = torch.from_numpy(np.asarray(pixels.observations[:, chosen], np.float32))
     lights = np.asarray(pixels.light_directions, np.float64)[chosen]
     normals = np.asarray(pixels.normals, np.float32)
@@ -202,9 +207,8 @@ def stored_scene(pixel_set: PixelSet, rng: np.random.Generator, generator: torch
 def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple[Capture, Floats, int]]:
     """Make scene number `index` into some captures, with true normals (P, 3), zero where nothing is to be seen.
 
-    The last item is the number of the scene, by which the fit tells scenes that it has not used.
-
-    Half of the scenes are of the pixel sets, if there are any, and have no near lamps.
+    The last item is the number of the scene, which keeps scenes apart in the fit. Half of the scenes are of the pixel
+    sets, if there are any, and have no near lamps.
     """
     rng, generator = np.random.default_rng([SEED, index]), torch.Generator().manual_seed(1000 * SEED + index)
     kinds = [str(kind) for kind in rng.choice(list(KINDS), CAPTURES_PER_SCENE, p=list(KINDS.values()))]

@@ -103,8 +103,9 @@ def fit_one(examples: Sequence[Example], seed: int) -> CaptureHead:
     captures = torch.stack([e.capture for e in examples])
     weights = torch.tensor([RIGHT_WEIGHT if e.kind.startswith("right") else 1.0 for e in examples])[number]
     inputs = torch.cat((errors, pixels, captures[number]), dim=1).numpy()
-    head.mean.copy_(torch.from_numpy(np.nanmean(inputs, axis=0)))
-    head.spread.copy_(torch.from_numpy(np.nanstd(inputs, axis=0) + 1e-3))
+    known = np.ma.masked_invalid(inputs)  # a feature may be unknown in all captures
+    head.mean.copy_(torch.from_numpy(known.mean(axis=0).filled(0)))
+    head.spread.copy_(torch.from_numpy(known.std(axis=0).filled(0) + 1e-3))
     blur = FEATURE_NOISE * head.spread[-captures.shape[1] :]
     optimiser = torch.optim.AdamW(head.parameters(), lr=1e-2, weight_decay=0.1)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2, total_steps=STEPS + 1)

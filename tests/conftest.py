@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from browser import browser, open_page
 from scenes import cap_directions, directions_at, shade, spiral_lights
+from small_pixel_sets import make_set
 from splinecli.system.progress import STAGES
 
-__all__ = ["browser", "directions_at", "open_page"]
+__all__ = ["browser", "directions_at", "make_set", "open_page"]
 GOLDEN = Path(__file__).resolve().parent / "golden"
 
 

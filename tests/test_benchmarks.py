@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from small_pixel_sets import matte_pixels
+from small_pixel_sets import MakeSet
 from splinecli import __version__
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
-from splinecli.pixel_sets.store import PixelSetWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
@@ -73,7 +72,7 @@ def test_photographs(run: Run) -> None:
 def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
-    printed = run("faulty_captures", str(tmp_path), "--scenes", "8", "--size", "24")
+    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
     assert int(printed.split()[0]) > 5
     rows = run("fit_capture_confidence", str(tmp_path)).splitlines()
     assert rows[0].startswith("| capture | number | claimed before")
@@ -81,12 +80,9 @@ def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert all(len(numbers(row)) == 8 for row in rows[2:])
 
 
-def test_faulty_captures_of_pixel_sets(run: Run, tmp_path: Path) -> None:
-    pixel_set = PixelSetWriter(tmp_path / "set")
-    pixels = matte_pixels(400, 30)
-    pixel_set.add("a", "one", "a test", {"by": "hand"}, pixels)
-    pixel_set.finish()
-    run("faulty_captures", str(tmp_path / "made"), "--scenes", "4", "--part", "2/2", "--sets", str(tmp_path / "set"))
+def test_faulty_captures_of_pixel_sets(run: Run, make_set: MakeSet, tmp_path: Path) -> None:
+    folder = str(make_set(entries=[("a", "one", 400, 30)]).folder)
+    run("faulty_captures", str(tmp_path / "made"), "--scenes", "4", "--part", "2/2", "--sets", folder)
     made = [dict(np.load(path)) for path in (tmp_path / "made").glob("*.npz")]
     assert len(made) >= 4
     assert len({int(each["scene"]) for each in made}) == 1

@@ -2,14 +2,11 @@
 
 import pytest
 
-from small_pixel_sets import make_set
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training import tasks
 from splinecli.training.config import TrainingConfig
 from tiny_networks import TINY
-
-__all__ = ["make_set"]
 
 
 @pytest.fixture(autouse=True)
