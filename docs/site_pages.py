@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "MODEL_CARD.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
+PAGES = ("README.md", "MODEL_CARD.md", "CREDITS.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
 SCRIPTS = ("examples/python_api.py", "examples/train_shipped_weights.sh")
 COMMANDS = "commands"
 

@@ -1,40 +1,77 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about eighteen hours on two cores:
+# Train the weights of spline-net that come with splinecli, as they were trained:
 #
-#     sh examples/train_shipped_weights.sh FOLDER
+#     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch]
 #
-# Needs the extra 'render' (pip install -c constraints.txt '.[render]'). If it is
-# interrupted, the same command continues. Seeds and numbers of steps are fixed. See MODEL_CARD.md.
+# SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
+# extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the last run starts
+# from earlier weights. With 'scratch', those are trained, too, and cnn-ps, in about eighteen hours on two cores. If it
+# is interrupted, the same command continues. See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
-
+shapes=${2:?name the folder of the meshes}
+relief=${3:?name the folder of the normal maps}
 splinecli=${SPLINECLI:-splinecli}
-"$splinecli" prepare --scenes 15 --size 96 --n-lights 200 --seed 21 -o "$folder/scenes"
-"$splinecli" prepare --scenes 120 --size 128 --n-lights 100 --seed 101 -o "$folder/whole-scenes"
+mkdir -p "$folder"
 
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
   name=$1
-  set=$2
-  shift 2
+  shift
   if [ -e "$folder/$name/finished" ]; then return; fi
   if [ -e "$folder/$name/checkpoint.safetensors" ]; then set -- "$@" --resume; fi
-  "$splinecli" train "$folder/$set" "$@" -o "$folder/$name"
+  "$splinecli" train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net-1 whole-scenes --preset compact --generator-weight 0.7 --steps 67000
-run spline-net-2 whole-scenes --preset compact --generator-weight 0.7 --steps 4000 --param learning_rate=1e-3 \
-  --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
-run spline-net-3 whole-scenes --preset refine --steps 47000 \
-  --param network.refines_twice=false --start-from "$folder/spline-net-2/weights.safetensors"
-run spline-net-4 whole-scenes --preset refine --steps 10000 --param learning_rate=4e-4 \
-  --start-from "$folder/spline-net-3/weights.safetensors"
-run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136
-run cnn-ps-2 scenes --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
-  --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-# The material net reads the tokens of the spline-net in the package, so put the new weights there first.
+start=$folder/start.safetensors
+if [ "${4:-}" = scratch ]; then
+  scenes=$folder/scenes
+  whole=$folder/whole-scenes
+  "$splinecli" prepare --scenes 15 --size 96 --n-lights 200 --seed 21 -o "$scenes"
+  "$splinecli" prepare --scenes 120 --size 128 --n-lights 100 --seed 101 -o "$whole"
+  run spline-net-1 "$whole" --preset compact --generator-weight 0.7 --steps 67000
+  run spline-net-2 "$whole" --preset compact --generator-weight 0.7 --steps 4000 --param learning_rate=1e-3 \
+    --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
+  run spline-net-3 "$whole" --preset refine --steps 47000 \
+    --param network.refines_twice=false --start-from "$folder/spline-net-2/weights.safetensors"
+  run spline-net-4 "$whole" --preset refine --steps 10000 --param learning_rate=4e-4 \
+    --start-from "$folder/spline-net-3/weights.safetensors"
+  run cnn-ps-1 "$scenes" --preset cnn-ps --generator-weight 3 --steps 8136
+  run cnn-ps-2 "$scenes" --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
+    --start-from "$folder/cnn-ps-1/weights.safetensors"
+  cp "$folder/spline-net-4/weights.safetensors" "$start"
+elif [ ! -e "$start" ]; then
+  # The mean that run 25 of docs/training-history.md ended with.
+  git show 0f312d9:src/splinecli/assets/spline-net.safetensors > "$start.part"
+  mv "$start.part" "$start"
+fi
+
+# 80 random shapes, and three random views of each of 19 meshes, relief on half of the scenes. The other two meshes are
+# those of the statues in docs/robustness.md.
+set --
+for map in "$relief"/*.jpg; do set -- "$@" --relief "$map"; done
+"$splinecli" prepare --scenes 80 --seed 202 "$@" -o "$folder/random"
+for name in boat boot cat dancing-girl demosthenes fish goathead hammer koala mountain penguin pizza plane scorpion \
+  skull spot sword torus wingnut; do set -- "$@" --mesh "$shapes/$name.ply"; done
+"$splinecli" prepare --views 3 --seed 201 "$@" -o "$folder/views"
+run optics "$folder/random" "$folder/views" --preset refine --start-from "$start" --seed 3 --steps 781 \
+  --param learning_rate=1e-4 --param pixels.optics_share=0.5
+
+# The mean of start and end is better on unseen scenes than either of them.
+${PYTHON:-python} - "$start" "$folder/optics/weights.safetensors" "$folder/weights.safetensors" <<'END'
+import sys
+from pathlib import Path
+from splinecli.networks.weights import load_weights, save_weights
+
+network, other = (load_weights(Path(name)).network for name in sys.argv[1:3])
+parameters = other.state_dict()
+network.load_state_dict({name: (value + parameters[name]) / 2 for name, value in network.state_dict().items()})
+save_weights(network, Path(sys.argv[3]))
+END
+echo "$folder/weights.safetensors"
+
+# The material net reads the tokens of the spline-net in the package, so put the new weights there first. Only a new
+# start changes them.
 #   python benchmarks/train_material_net.py draw "$folder/material"
 #   python benchmarks/train_material_net.py train "$folder/material" --ship
-echo "$folder/spline-net-4/weights.safetensors"
-echo "$folder/cnn-ps-2/weights.safetensors"
