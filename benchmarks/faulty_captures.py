@@ -220,8 +220,9 @@ def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple
     made = []
     for kind, (radiance, mask, normals, lights, scene, lamps) in zip(kinds, scenes, strict=bool(scenes)):
         single = lights.astype(np.float32)
-        if lamps is None:  # whose places depend on the size of the images
-            mask = np.pad(mask, REACH)  # a dark margin, which a lens and its inverse filter mix with the outline
+        mask = np.pad(mask, REACH)  # a dark margin, which a lens and its inverse filter mix with the outline
+        if lamps is not None:
+            lamps = lamps.within(-REACH, -REACH, 1, None)
         if kind == "no mask":
             margin = [(int(rng.integers(16)),) * 2] * 2
             mask = np.pad(mask, margin)

@@ -30,6 +30,12 @@ from splinecli.system.files import StrPath, is_found_file
 _FILE = "a text file with a line {} for each image"
 
 
+class WrongCountError(InputError):
+    """A light file is for another number of images: n_found."""
+
+    n_found = 0
+
+
 def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     meaning = light_rows.COLUMNS[form]
     return light_rows.read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
@@ -241,11 +247,10 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     table = _drop_count_line(numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
-    # Such numbers and their inverses are within float32's range.
-    for light, channel in np.argwhere((intensities < 1e-12) | (intensities > 1e12)):
+    for light, channel in np.argwhere(~light_rows.usable_intensities(intensities)):
         value, line = intensities[light, channel], table.rows[channel if transposed else light].line
         place = f" in column {light + 1}" if transposed else ""
-        expected = "above 0" if value <= 0 else "from 1e-12 to 1e+12"
+        expected = "above 0" if value <= 0 else light_rows.INTENSITIES
         problem = f"found the intensity {value:g}{place}, expected a number {expected}"
         raise InputError(problem, path=table.path, line=line)
     return np.broadcast_to(intensities, (n_images, 3)).copy()
@@ -306,7 +311,9 @@ def _one_light_a_row(
     what = {"light directions": "light direction", "lights": "light"}.get(what, what) if count == 1 else what
     problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
-    raise InputError(problem, path=table.path, hint=hint)
+    error = WrongCountError(problem, path=table.path, hint=hint)
+    error.n_found = count
+    raise error
 
 
 def rows_text(values: Float64Array) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats import numbers
 from splinecli.capture.formats.numbers import NumberRows, Row, to_number
-from splinecli.capture.light_rows import RowForm, image_name
+from splinecli.capture.light_rows import INTENSITIES, RowForm, image_name, usable_intensities
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
 from splinecli.records import Positive
@@ -126,10 +126,10 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
         raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
-    usable = all(1e-12 <= factor <= 1e12 for light in factors for factor in light)
+    usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
-        raise InputError(problem if usable else 'a factor of "ledAdjust" is not from 1e-12 to 1e+12', path=path)
+        raise InputError(problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path=path)
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
 

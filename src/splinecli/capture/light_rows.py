@@ -13,7 +13,7 @@ import numpy as np
 
 from splinecli.capture.formats.numbers import NumberRows, Row, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Float64Array
+from splinecli.maths import Bools, Float64Array
 
 AXIS_WORDS = {
     "x-right": (0, 1),
@@ -24,6 +24,9 @@ AXIS_WORDS = {
     "z-away": (2, -1),
 }
 """The words of --light-frame: an axis of the file, and its sign in the usual frame."""
+
+INTENSITIES = "from 1e-12 to 1e+12"
+"""The range of light intensities. Such numbers and their inverses are within the range of float32."""
 
 EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
 
@@ -248,3 +251,8 @@ def image_name(text: str, numbers: list[str]) -> str:
     for word in reversed(numbers):
         text = text.rstrip(" \t,;")[: -len(word)]
     return re.split(r"[/\\]", text.strip(" \t,;\"'"))[-1]
+
+
+def usable_intensities(values: Float64Array) -> Bools:
+    """Return which values are within INTENSITIES."""
+    return (values >= 1e-12) & (values <= 1e12)

@@ -17,7 +17,13 @@ from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
 from splinecli.capture.formats.numbers import NumberRows
 from splinecli.capture.layouts import find_capture_files
-from splinecli.capture.light_files import match_images, read_light_intensities, read_lights, unit_directions
+from splinecli.capture.light_files import (
+    WrongCountError,
+    match_images,
+    read_light_intensities,
+    read_lights,
+    unit_directions,
+)
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeholders
 from splinecli.capture.source import CaptureSource, Progress
@@ -106,8 +112,8 @@ def open_capture(
     in_folder = files.images
     try:
         files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
-    except InputError as error:
-        if channels is None or ", one for each image" not in error.problem:
+    except WrongCountError as error:
+        if channels is None:
             raise
         problem = error.problem.replace("one for each image", "three for each image")
         hint = "With --lights-in-channels, the file needs three lines for each image, in the order R, G, B"
@@ -263,12 +269,11 @@ def _match_count(
             if len(alike) < len(images):
                 with suppress(InputError):
                     return alike, *read_lights(path, len(alike), frame, form)
-        found = re.match(r"found (\d+) [a-z ]+, expected \d+, one for each image", error.problem)
-        if found is None or int(found[1]) >= len(images):
+        if not isinstance(error, WrongCountError) or error.n_found >= len(images):
             raise
-        names = [image.name for image in images[int(found[1]) :]]
+        names = [image.name for image in images[error.n_found :]]
         hint = f"In this order, it has none for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
-        raise InputError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
+        raise WrongCountError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 
 def _stated_size(image: Path) -> tuple[int, ...] | None:
