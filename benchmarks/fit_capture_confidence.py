@@ -35,8 +35,8 @@ HEADS, HIDDEN = 4, 6
 FEATURE_NOISE = 0.2
 """Standard deviation of the noise on the features of captures in the fit, in their spread. It keeps the fit smooth."""
 
-RIGHT_WEIGHT = 2.0
-"""Weight of right captures in the fit. Most captures are right."""
+WEIGHTS = {"right": 2.0, "near lamps": 2.0}
+"""Weights of captures in the fit, otherwise 1. Most captures are right; scenes of pixel sets have no near lamps."""
 
 
 class Example(NamedTuple):
@@ -101,7 +101,7 @@ def fit_one(examples: Sequence[Example], seed: int) -> CaptureHead:
         torch.cat([getattr(e, name) for e in examples]) for name in ("errors", "pixels", "errors_deg")
     )
     captures = torch.stack([e.capture for e in examples])
-    weights = torch.tensor([RIGHT_WEIGHT if e.kind.startswith("right") else 1.0 for e in examples])[number]
+    weights = torch.tensor([WEIGHTS.get(e.kind.partition(",")[0], 1.0) for e in examples])[number]
     inputs = torch.cat((errors, pixels, captures[number]), dim=1).numpy()
     known = np.ma.masked_invalid(inputs)  # a feature may be unknown in all captures
     head.mean.copy_(torch.from_numpy(known.mean(axis=0).filled(0)))

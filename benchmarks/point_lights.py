@@ -7,7 +7,7 @@ from torch import Tensor
 
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer, VisibleSurface
-from splinecli.synthesis.scenes import Materials
+from splinecli.synthesis.scenes import Materials, before_black
 
 
 def render_point_lights(
@@ -43,7 +43,7 @@ def render_point_lights(
         for name, material in materials.items():
             shaded = material.take(patches).shade(shading, towards_camera, above) * torch.from_numpy(falloff)
             radiance[name][rows] = shaded.view(len(rows), samples, -1).mean(dim=1)
-    return radiance
+    return before_black(radiance, visible)
 
 
 def _light_at(hits: Hits, positions: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

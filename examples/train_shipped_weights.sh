@@ -5,13 +5,21 @@
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
 # extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the last run starts
-# from earlier weights. With 'scratch', those are trained, too, and cnn-ps, in about eighteen hours on two cores. If it
-# is interrupted, the same command continues. See MODEL_CARD.md.
+# from earlier weights. With 'scratch', it trains those as well as cnn-ps, in an estimated eighteen hours on two cores.
+# If it is interrupted, the same command continues. See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
 shapes=${2:?name the folder of the meshes}
 relief=${3:?name the folder of the normal maps}
 splinecli=${SPLINECLI:-splinecli}
+python=${PYTHON:-python}
+fail() {
+  echo "$0: $1" >&2
+  exit 1
+}
+case ${4:-} in '' | scratch) ;; *) fail "found $4, expected 'scratch' or nothing" ;; esac
+"$python" -c 'import splinecli' || fail "activate the environment of splinecli, or set PYTHON"
+[ -e "$shapes/boat.ply" ] || fail "found no boat.ply in $shapes, expected the meshes of CREDITS.md"
 mkdir -p "$folder"
 
 # Resume a run that was interrupted; skip a run that is finished.
@@ -24,7 +32,7 @@ run() {
   touch "$folder/$name/finished"
 }
 
-start=$folder/start.safetensors
+start=$folder/start${4:-}.safetensors
 if [ "${4:-}" = scratch ]; then
   scenes=$folder/scenes
   whole=$folder/whole-scenes
@@ -43,7 +51,8 @@ if [ "${4:-}" = scratch ]; then
   cp "$folder/spline-net-4/weights.safetensors" "$start"
 elif [ ! -e "$start" ]; then
   # The mean that run 25 of docs/training-history.md ended with.
-  git show 0f312d9:src/splinecli/assets/spline-net.safetensors > "$start.part"
+  git -C "$(dirname "$0")" show 0f312d98fe0c1a14ff44c5f8e2ca09a7218d5f43:src/splinecli/assets/spline-net.safetensors \
+    > "$start.part" || fail "needs a clone with its history: git fetch --unshallow"
   mv "$start.part" "$start"
 fi
 
@@ -55,11 +64,11 @@ for map in "$relief"/*.jpg; do set -- "$@" --relief "$map"; done
 for name in boat boot cat dancing-girl demosthenes fish goathead hammer koala mountain penguin pizza plane scorpion \
   skull spot sword torus wingnut; do set -- "$@" --mesh "$shapes/$name.ply"; done
 "$splinecli" prepare --views 3 --seed 201 "$@" -o "$folder/views"
-run optics "$folder/random" "$folder/views" --preset refine --start-from "$start" --seed 3 --steps 781 \
+run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from "$start" --seed 3 --steps 781 \
   --param learning_rate=1e-4 --param pixels.optics_share=0.5
 
 # The mean of start and end is better on unseen scenes than either of them.
-${PYTHON:-python} - "$start" "$folder/optics/weights.safetensors" "$folder/weights.safetensors" <<'END'
+"$python" - "$start" "$folder/optics${4:-}/weights.safetensors" "$folder/weights.safetensors" <<'END'
 import sys
 from pathlib import Path
 from splinecli.networks.weights import load_weights, save_weights
@@ -71,7 +80,7 @@ save_weights(network, Path(sys.argv[3]))
 END
 echo "$folder/weights.safetensors"
 
-# The material net reads the tokens of the spline-net in the package, so put the new weights there first. Only a new
-# start changes them.
+# The material net reads the tokens of the spline-net in the package, so put the new weights there first. These
+# tokens change only with a new start.
 #   python benchmarks/train_material_net.py draw "$folder/material"
 #   python benchmarks/train_material_net.py train "$folder/material" --ship

@@ -25,7 +25,8 @@ AXIS_WORDS = {
 }
 """The words of --light-frame: an axis of the file, and its sign in the usual frame."""
 
-INTENSITIES = "from 1e-12 to 1e+12"
+_LEAST, _MOST = 1e-12, 1e12
+INTENSITIES = f"from {_LEAST:g} to {_MOST:g}"
 """The range of light intensities. Such numbers and their inverses are within the range of float32."""
 
 EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
@@ -255,4 +256,4 @@ def image_name(text: str, numbers: list[str]) -> str:
 
 def usable_intensities(values: Float64Array) -> Bools:
     """Return which values are within INTENSITIES."""
-    return (values >= 1e-12) & (values <= 1e12)
+    return (values >= _LEAST) & (values <= _MOST)

@@ -66,10 +66,10 @@ def render_direct(
                 shape = (-1, visible.samples_per_pixel, len(lights))
                 torch.mean(shaded.view(shape), dim=1, out=radiance[name][target])
         progress((rows[-1] + 1) / pixels)
-    return _covered(radiance, visible)
+    return before_black(radiance, visible)
 
 
-def _covered(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
+def before_black(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
     """Return the radiance in front of a black background, weighted by the coverage of each pixel."""
     coverage = torch.from_numpy(visible.coverage)[:, None]
     return {name: values.mul_(coverage) for name, values in radiance.items()}
@@ -135,7 +135,7 @@ def render_indirect(
             if not len(alive):
                 break
         progress((int(rows[-1]) + 1) / pixels)
-    return _covered(radiance, visible)
+    return before_black(radiance, visible)
 
 
 def soften(material: PrincipledMaterial) -> PrincipledMaterial:
