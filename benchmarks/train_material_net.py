@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
 from splinecli.networks.material_net import Gloss, MaterialNet
-from splinecli.networks.set_branch import SAMPLE, PixelTokens
+from splinecli.networks.set_branch import PixelTokens
 from splinecli.networks.weights import MATERIAL_FORMAT, SHIPPED, resolve_weights, save_module
 from splinecli.synthesis import draw_uniform
 from splinecli.synthesis.batches import PixelBatch
@@ -30,7 +30,7 @@ from splinecli.synthesis.pixels import PixelGeneratorConfig, PixelScene, draw_sc
 from splinecli.synthesis.whole_capture import photograph_captures
 from splinecli.system.files import file_sha256
 
-BATCHES, CAPTURES = 64, 8  # of a shard, and captures of a batch
+BATCHES, CAPTURES, PIXELS = 64, 8, 256  # of a shard, of a batch, and of a capture
 SPHERES = 24  # number of shards whose captures have the normals of spheres
 RATE = 2e-3
 
@@ -63,7 +63,7 @@ def draw(folder: Path, shards: int) -> None:
             own, shown = batch.truth.material, batch.exposure / pixels.scale
             logs = [(value * shown).clamp(1e-4, 1e3).log() for value in (own.base, 0.08 * own.specular)]
             targets = torch.cat((own.roughness, own.metallic, *logs, own.minnaert, own.tail_exponent), dim=1)
-            relative = pixels.scale / context.brightness.repeat(SAMPLE)[:, None]
+            relative = pixels.scale / context.brightness.repeat(PIXELS)[:, None]
             rows.append((pixels.tokens.half(), pixels.normal_z, relative, pixels.n_lights, targets))
         named = zip((*PixelTokens._fields, "targets"), zip(*rows, strict=True), strict=True)
         tensors = {name: torch.stack(parts) for name, parts in named}
@@ -78,7 +78,7 @@ def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
     The normals of a capture are then drawn together by a factor of 10^U(-2, 0), about a direction 0 to 60 degrees from
     the camera axis. Whether a highlight is visible depends on them.
     """
-    config, pixels = PixelGeneratorConfig(capture_pixels=SAMPLE), CAPTURES * SAMPLE
+    config, pixels = PixelGeneratorConfig(capture_pixels=PIXELS), CAPTURES * PIXELS
     scene = draw_scene(pixels, config, generator)
     if are_narrow:
         polar = draw_uniform(generator, CAPTURES, 1, high=math.radians(60))
@@ -96,8 +96,8 @@ def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
             mixed = replace(mixed, normals=narrow(mixed.normals))
         scene = replace(scene, normals=narrow(scene.normals), mixed=mixed)
     counts = draw_light_counts(CAPTURES, config.min_lights, config.max_lights, config.usual_lights, generator)
-    directions = draw_light_directions(CAPTURES, int(counts.max()), generator).repeat(SAMPLE, 1, 1)
-    valid = torch.arange(directions.shape[1]) < counts.repeat(SAMPLE)[:, None]
+    directions = draw_light_directions(CAPTURES, int(counts.max()), generator).repeat(PIXELS, 1, 1)
+    valid = torch.arange(directions.shape[1]) < counts.repeat(PIXELS)[:, None]
     return photograph_captures(scene, scene.radiance(directions), directions, valid, config, generator)
 
 

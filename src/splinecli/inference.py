@@ -207,7 +207,7 @@ def estimate_pixels(
     # Directions that differ from pixel to pixel are computed in float64.
     each = 1 if lighting_at(np.arange(1)).directions.ndim == 2 else 10
     tile_pixels = min(estimator.tile_pixels, max(TILE_PIXELS, _TILE_VALUES // (each * observations.shape[1])))
-    estimator = estimator.bind(lighting_at, n_pixels)
+    estimator = estimator.bind(lighting_at, mask)
     for pixels in parts_of_pixels(n_pixels, tile_pixels):
         estimate(pixels, lighting_at(pixels), progress)
     if refiner is None or errors is None:
@@ -217,7 +217,7 @@ def estimate_pixels(
     if indirect is not None:
         lighting_at = partial(lighting_without, indirect)
         # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
-        estimator = estimator.rebind(lighting_at, n_pixels)
+        estimator = estimator.rebind(lighting_at, mask)
         for pixels in parts_of_pixels(n_pixels, tile_pixels):
             changed = pixels[indirect.counts_at(observations[pixels], pixels)]
             if len(changed):

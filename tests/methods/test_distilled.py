@@ -105,7 +105,7 @@ def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> 
     said = normals[:, [1, 0, 2]] if followed else noisy(normals, 40)
     teacher = sure(np.concatenate((observations, changed)), np.concatenate((normals, said)), 4)
     found = distil(teacher, distant(observations), 8000, SIZE)
-    anew = found.rebind(distant(changed), 8000)
+    anew = found.rebind(distant(changed), np.ones((80, 100), np.bool_))
     assert angle_between_deg(anew.estimate_with_error(changed, LIGHTS)[0], said).mean() < 3
     if followed:
         assert isinstance(anew, DistilledEstimator) and anew.n_unlike < 1000

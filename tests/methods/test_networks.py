@@ -8,17 +8,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from scenes import directions_at, evaluate, shade
+from scenes import directions_at, evaluate, shade, sphere, spiral_lights
 from splinecli.evaluation.protocol import Protocol
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.batched import NetworkEstimator, rotations_of
+from splinecli.methods.batched import NetworkEstimator, context_sample, rotations_of
 from splinecli.methods.estimator import CONFIDENT_DEG
 from splinecli.networks.li_ne_net import probability_within
 from splinecli.networks.spline_net import SplineNet, to_pixel_frame
@@ -90,10 +91,15 @@ def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) 
     return lambda rows: PixelLighting(observations[rows], lights)
 
 
+def row(n_pixels: int) -> NDArray[np.bool_]:
+    """Return the mask (1, P) of pixels that have neighbours on two sides, as at the border of an image."""
+    return np.ones((1, n_pixels), np.bool_)
+
+
 def test_pixels_see_their_capture_and_not_their_tile() -> None:
     observations, lights = pixels(600)
     network = estimator(random_network(**SEES), batch_size=100)
-    whole = network.bind(lighting_at(observations, lights), 600)
+    whole = network.bind(lighting_at(observations, lights), row(600))
     expected, errors = whole.estimate_with_error(observations, lights)
     for tile in (slice(0, 30), slice(250, 600)):
         found, found_errors = whole.estimate_with_error(observations[tile], lights)
@@ -112,15 +118,36 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     expected = network.estimate(observations, lights)
     dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
     with_background = np.concatenate((dark[:400], observations, dark[400:]))
-    found = network.bind(lighting_at(with_background, lights), 1000).estimate(with_background, lights)
+    found = network.bind(lighting_at(with_background, lights), row(1000)).estimate(with_background, lights)
     assert angle_between_deg(found[400:600], expected).max() < 0.01
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
+
+
+def test_outline_pixels_that_the_object_covers_in_part_are_not_sampled() -> None:
+    normals, mask = sphere(24)
+    lights = spiral_lights(10)
+    outline = ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))[mask] > 0)
+    full = (shade(normals[mask], lights) + 0.01).astype(np.float32)
+    share = np.where(outline, np.random.default_rng(2).uniform(0.2, 0.8, len(full)), 1).astype(np.float32)
+    photographed = full * share[:, None]
+    assert len(context_sample(lighting_at(full, lights), mask)[0]) > np.count_nonzero(~outline)
+    np.testing.assert_array_equal(context_sample(lighting_at(photographed, lights), mask)[0], full[~outline])
+    # A mask without inner pixels is sampled as it is.
+    line = np.eye(30, dtype=np.bool_)
+    assert len(context_sample(lighting_at(photographed[:30], lights), line)[0]) == 30
+    # Those at the outline thus change nothing for the others.
+    network = make_estimator("spline-net")
+    errors = [
+        angle_between_deg(network.bind(lighting_at(seen, lights), mask).estimate(seen, lights), normals[mask])[~outline]
+        for seen in (full, photographed)
+    ]
+    assert errors[1].mean() == pytest.approx(errors[0].mean(), abs=0.1)
 
 
 def test_methods_that_see_no_capture_stay_as_they_are() -> None:
     observations, lights = pixels(20)
     for method in (estimator(), make_estimator("ls")):
-        assert method.bind(lighting_at(observations, lights), 20) is method
+        assert method.bind(lighting_at(observations, lights), row(20)) is method
 
 
 # Mean angular errors in degrees, on Ball and Cat: ours, and the published ones. The published ones for all 96 lights

@@ -138,7 +138,7 @@ def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) ->
     _, lights, observations = glossy_pixels
     some = observations[:6].astype(np.float32)
     turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
-    method = make(name).bind(lambda rows: PixelLighting(some[rows], turned[rows]), len(some))
+    method = make(name).bind(lambda rows: PixelLighting(some[rows], turned[rows]), np.ones((1, len(some)), np.bool_))
     together = method.estimate(some, turned)
     pairs = [method.estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
     assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05

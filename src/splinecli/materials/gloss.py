@@ -32,7 +32,7 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
     if not len(chosen):
         chosen = np.arange(len(rows))
     with torch.inference_mode(), one_thread_each():
-        observations, directions = context_sample(lambda pixels: lighting_at(chosen[pixels]), len(chosen))
+        observations, directions = context_sample(lighting_at, mask)
         of_sample, context = network.encode_pixels(observations, directions)
         assert context is not None  # spline-net has a set branch
         _, summary = material_net(of_sample, context.brightness)

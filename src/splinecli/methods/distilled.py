@@ -21,6 +21,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from splinecli.errors import UsageError
 from splinecli.fits.least_squares import weighted_least_squares
 from splinecli.lights.lighting import LightingAt
+from splinecli.maths import Bools
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import map_scale
 from splinecli.methods.estimator import (
@@ -277,11 +278,11 @@ class DistilledEstimator(Estimator):
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
-    def rebind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
+    def rebind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
         """Learn the capture again after its observations changed. Return the network if it cannot be learned."""
-        teacher = self._teacher.bind(lighting_at, n_pixels)
+        teacher = self._teacher.bind(lighting_at, mask)
         try:
-            learned = distil(teacher, lighting_at, n_pixels, self._size)
+            learned = distil(teacher, lighting_at, int(np.count_nonzero(mask)), self._size)
         except UsageError:  # too few pixels are still lit
             return teacher
         return learned if learned.distillation.is_good else teacher

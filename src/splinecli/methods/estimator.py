@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.fits.robust import solve_each
+from splinecli.maths import Bools
 from splinecli.maths.normals import unit
 from splinecli.system.progress import Progress, ignore
 
@@ -103,16 +104,16 @@ class Estimator:
         """
         return self.estimate(observations, light_directions, progress=progress), None
 
-    def bind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
-        """Return the estimator for the `n_pixels` pixels of one capture, possibly with an encoded sample as context.
+    def bind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
+        """Return the estimator for one capture, possibly with an encoded sample of its pixels as context.
 
-        `lighting_at` gives the observations and the light directions of some pixels.
+        `lighting_at` gives the observations and the light directions of some of the pixels of the mask (H, W).
         """
         return self
 
-    def rebind(self, lighting_at: LightingAt, n_pixels: int) -> Estimator:
+    def rebind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
         """Return the estimator, made by `bind`, for the same capture with other observations."""
-        return self.bind(lighting_at, n_pixels)
+        return self.bind(lighting_at, mask)
 
     def observation_maps(
         self,

@@ -18,7 +18,7 @@ from splinecli.fits.robust import inverse_3x3, lit_values, multiply_symmetric
 from splinecli.networks.config import HEAD_WIDTH
 from splinecli.networks.li_ne_net import zeroed
 
-SAMPLE = 256  # number of pixels of a capture that all its pixels attend to
+SAMPLE = 512  # number of pixels of a capture that all its pixels attend to
 
 
 class Summary(NamedTuple):

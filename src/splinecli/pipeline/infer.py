@@ -113,7 +113,7 @@ def distil_for(
     if sizes[0].sample < FEWEST_PIXELS:
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
-    teacher = estimator.bind(lighting_at, capture.n_pixels)
+    teacher = estimator.bind(lighting_at, capture.mask)
     from splinecli.methods.distilled import distil
 
     for size in sizes:
