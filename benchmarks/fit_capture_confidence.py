@@ -29,7 +29,7 @@ from splinecli.system.files import file_sha256
 Floats = NDArray[np.floating]
 
 PIXELS, STEPS = 80, 500
-HEADS, HIDDEN = 4, 6
+HEADS, HIDDEN = 8, 6
 """The mean of so many heads, of so many hidden units each, is one head of all their units."""
 
 FEATURE_NOISE = 0.2

@@ -177,7 +177,7 @@ class CaptureHead(nn.Module):
     mean: Tensor
     spread: Tensor
 
-    def __init__(self, hidden: int = 24) -> None:
+    def __init__(self, hidden: int = 48) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(_INPUTS))
         self.register_buffer("spread", torch.ones(_INPUTS))
