@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights of spline-net that come with splinecli, as they were trained:
+# Repeat the run that made the weights of spline-net that come with splinecli:
 #
 #     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch]
 #
@@ -20,6 +20,7 @@ fail() {
 case ${4:-} in '' | scratch) ;; *) fail "found $4, expected 'scratch' or nothing" ;; esac
 "$python" -c 'import splinecli' || fail "activate the environment of splinecli, or set PYTHON"
 [ -e "$shapes/boat.ply" ] || fail "found no boat.ply in $shapes, expected the meshes of CREDITS.md"
+ls "$relief"/*.jpg > /dev/null 2>&1 || fail "found no .jpg in $relief, expected the normal maps of CREDITS.md"
 mkdir -p "$folder"
 
 # Resume a run that was interrupted; skip a run that is finished.
@@ -50,7 +51,7 @@ if [ "${4:-}" = scratch ]; then
     --start-from "$folder/cnn-ps-1/weights.safetensors"
   cp "$folder/spline-net-4/weights.safetensors" "$start"
 elif [ ! -e "$start" ]; then
-  # The mean that run 25 of docs/training-history.md ended with.
+  # The weights after run 25 of docs/training-history.md.
   git -C "$(dirname "$0")" show 0f312d98fe0c1a14ff44c5f8e2ca09a7218d5f43:src/splinecli/assets/spline-net.safetensors \
     > "$start.part" || fail "needs a clone with its history: git fetch --unshallow"
   mv "$start.part" "$start"

@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -92,7 +91,7 @@ def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) 
 
 
 def row(n_pixels: int) -> NDArray[np.bool_]:
-    """Return the mask (1, P) of pixels that have neighbours on two sides, as at the border of an image."""
+    """Return a mask (1, P) that fills its image, so that no pixel is at an outline."""
     return np.ones((1, n_pixels), np.bool_)
 
 
@@ -123,25 +122,48 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
 
-def test_outline_pixels_that_the_object_covers_in_part_are_not_sampled() -> None:
-    normals, mask = sphere(24)
-    lights = spiral_lights(10)
-    outline = ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))[mask] > 0)
-    full = (shade(normals[mask], lights) + 0.01).astype(np.float32)
-    share = np.where(outline, np.random.default_rng(2).uniform(0.2, 0.8, len(full)), 1).astype(np.float32)
-    photographed = full * share[:, None]
-    assert len(context_sample(lighting_at(full, lights), mask)[0]) > np.count_nonzero(~outline)
-    np.testing.assert_array_equal(context_sample(lighting_at(photographed, lights), mask)[0], full[~outline])
-    # A mask without inner pixels is sampled as it is.
-    line = np.eye(30, dtype=np.bool_)
-    assert len(context_sample(lighting_at(photographed[:30], lights), line)[0]) == 30
-    # Those at the outline thus change nothing for the others.
-    network = make_estimator("spline-net")
-    errors = [
-        angle_between_deg(network.bind(lighting_at(seen, lights), mask).estimate(seen, lights), normals[mask])[~outline]
-        for seen in (full, photographed)
-    ]
-    assert errors[1].mean() == pytest.approx(errors[0].mean(), abs=0.1)
+def sampled(brightness: NDArray[np.float64], mask: NDArray[np.bool_]) -> list[float]:
+    """Return the brightness (H, W) of the pixels that are sampled from a capture."""
+    observations = np.repeat(brightness[mask].astype(np.float32)[:, None], 4, axis=1)
+    found, _ = context_sample(lighting_at(observations, spiral_lights(4)), mask)
+    return found[:, 0].tolist()
+
+
+def test_outline_pixels_darker_than_their_inner_neighbours_are_not_sampled() -> None:
+    mask = np.zeros((14, 14), np.bool_)
+    mask[:12, 1:13] = True  # cut by the upper border of the image
+    brightness = np.ones((14, 14))
+    brightness[0, 2:12] = 0.5  # at the border, where the object continues
+    brightness[11, 2], brightness[5, 1], brightness[8, 6] = 0.75, 0.9375, 0.25
+    assert sampled(brightness, mask) == brightness[mask & (brightness != 0.75)].tolist()
+    brightness[4, 2] = 1.25  # an inner neighbour of (5, 1), which has 0.87 times their mean
+    assert 0.9375 in sampled(brightness, mask)
+    # A mask without inner pixels, and one with few, are sampled as they are.
+    line = np.eye(14, dtype=np.bool_)
+    assert len(sampled(brightness, line)) == 14
+    mask[5:] = False
+    brightness[4] = 0.5
+    assert len(sampled(brightness, mask)) == mask.sum()
+
+
+def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_others() -> None:
+    """Without context, all pixels of a call are sampled."""
+    size, factor, lights = 32, 8, spiral_lights(10)
+    normals, inside = sphere(size * factor)
+
+    def photographed(values: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.asarray((values * inside[..., None]).reshape(size, factor, size, factor, -1).mean(axis=(1, 3)))
+
+    covered = photographed(np.ones((*inside.shape, 1)))[..., 0]
+    mask = covered > 0.3
+    truth, seen = unit(photographed(normals)[mask]), photographed(shade(normals, lights, gloss=0.5))[mask]
+    network, observations = make_estimator("spline-net-pixelwise"), seen.astype(np.float32)
+    bound = network.bind(lighting_at(observations, lights), mask)
+    whole, alone = (
+        angle_between_deg(method.estimate(observations, lights), truth)[covered[mask] == 1].mean()
+        for method in (bound, network)
+    )
+    assert whole < 0.6 * alone
 
 
 def test_methods_that_see_no_capture_stay_as_they_are() -> None:

@@ -144,7 +144,7 @@ def plan_capture(
     protocols = tuple(task.protocol for task in able)
     methods = {trial.method for draw in needed for trial in draw}
     whole = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
-    whole = whole or any(estimator.refiner is not None for estimator in estimators if estimator.name in methods)
+    whole = whole or any(estimator.needs_capture for estimator in estimators if estimator.name in methods)
     seen = sorted({light for draw in needed for light in draw[0].lights})
     return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
 

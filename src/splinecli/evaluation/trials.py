@@ -188,7 +188,7 @@ class SharedDraw:
         `begin` is called with the number of pixels before they are estimated and returns a function that counts
         finished pixels. Raises SplinecliError if the method returns normals that are not unit vectors.
         """
-        source, whole = self._source, estimator.refiner is not None
+        source, whole = self._source, estimator.needs_capture
         with self._lock:
             if whole not in self._captures:
                 self._captures[whole] = source.see(trial, whole=whole)
@@ -244,7 +244,7 @@ class CaptureReading:
     name: str
     protocols: tuple[Protocol, ...]  # the protocols that can score it; they all score the same pixels
     lights: tuple[int, ...]  # the lights used by any trial, in ascending order
-    whole: bool  # whether all pixels are needed: a method uses neighbours, or lights are refined or estimated
+    whole: bool  # whether all pixels are needed: a method uses them, or lights are refined or estimated
 
     def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
         """Return the capture under all lights, and the notes on it, by protocol. Raises InputError, UsageError."""

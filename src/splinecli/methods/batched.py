@@ -117,14 +117,16 @@ Precision = Literal["float32", "bfloat16"]
 
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 _FEWEST_COVERED = 64  # with fewer fully covered candidates, all are used
-_COVERED = 0.85  # an outline pixel is fully covered if it is at least so bright, relative to its inner neighbours
+_COVERED = 0.85  # smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
 
 
 def context_sample(lighting_at: LightingAt, mask: Bools) -> tuple[Tensor, Tensor]:
     """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a capture's pixels.
 
-    The mask (H, W) has one or more true pixels. The object covers some of those at its outline only in part. They are
-    not sampled, because they are too dark: on rendered spheres of 40 pixels, they doubled the error of the others.
+    The mask (H, W) has one or more true pixels. Outline pixels that the object covers only in part are left out,
+    because they are too dark: on rendered spheres of 40 pixels, they doubled the error of the other pixels. On small
+    objects, the rule also leaves out some steep pixels that are fully covered. It requires a mask that ends at the
+    outline, because it finds the outline in the mask.
     """
     n_pixels = int(np.count_nonzero(mask))
     candidates = np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp)
@@ -142,19 +144,17 @@ def _is_covered(pixels: PixelIndices, brightest: Floats, mask: Bools, lighting_a
     from cv2 import erode
 
     covered = np.ones(len(pixels), np.bool_)
-    inner = (
-        erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    )  # at the border of the image, the object continues
+    # At the border of the image, the object continues.
+    inner = erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rows, columns = PixelPlaces(mask).places(pixels)
     at_outline = np.flatnonzero(~inner[rows, columns])
-    near = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
+    near = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2) + 1
     rows, columns = (np.stack((rows, columns), axis=1)[at_outline, None] + near).transpose(2, 0, 1)
-    rows, columns = rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)
-    is_inner = inner[rows, columns]
+    is_inner = np.pad(inner, 1)[rows, columns]
     if not is_inner.any():
         return covered
-    numbers = np.cumsum(mask, dtype=np.int32).reshape(mask.shape)[rows, columns] - 1
-    known, places = np.unique(numbers[is_inner], return_inverse=True)
+    numbers = np.cumsum(mask, dtype=np.int32).reshape(mask.shape) - 1
+    known, places = np.unique(numbers[rows[is_inner] - 1, columns[is_inner] - 1], return_inverse=True)
     of_inner = np.zeros(is_inner.shape)
     of_inner[is_inner] = lighting_at(known).observations.max(axis=1)[places]
     covered[at_outline] = brightest[at_outline] * is_inner.sum(axis=1) >= _COVERED * of_inner.sum(axis=1)
@@ -199,10 +199,11 @@ class NetworkEstimator(Estimator):
         self.has_confidence = self.network.config.error_head
         refine_net = self.network.refine_net
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
+        self.needs_capture = self.refiner is not None or self.network.config.sees_capture
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.network.config.sees_capture:
             # Older trials used smaller contexts, with all pixels of the outline, and one context for all rotations.
-            self.fingerprint += f" of a capture with {SAMPLE} covered pixels"
+            self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
             self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)

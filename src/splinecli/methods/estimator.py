@@ -70,6 +70,7 @@ class Estimator:
     device, precision: where and in which number format it computes; the report states both.
     fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
     has_confidence: whether it also estimates its own accuracy.
+    needs_capture: whether its estimate of a pixel depends on the other pixels and the mask.
     tile_pixels: the number of pixels that it gets at once.
     refiner: corrects the map of normals, using the neighbourhood of each pixel; or None.
     """
@@ -80,6 +81,7 @@ class Estimator:
     precision: str = "float64"
     fingerprint: str
     has_confidence: bool = False
+    needs_capture: bool = False
     tile_pixels: int = TILE_PIXELS
     refiner: NetworkRefiner | None = None
 
