@@ -19,6 +19,7 @@ from splinecli.fits.least_squares import alternating_signs
 from splinecli.inference import estimate_normals
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import unit
+from splinecli.methods import make_estimator
 from splinecli.methods.batched import NetworkEstimator
 from splinecli.methods.estimator import UNKNOWN_ERROR
 from splinecli.networks.config import NetworkConfig
@@ -133,10 +134,11 @@ def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
     assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
 
 
-def test_scored_pixels_are_refined_among_all() -> None:
-    """Scoring 50 pixels needs the whole map: they score as they do in the map of `infer`."""
+@pytest.mark.parametrize("of_package", [False, True])
+def test_scored_pixels_are_estimated_among_all(of_package: bool) -> None:
+    """Refinement and context need the whole capture: 50 pixels score as they do in the map of `infer`."""
     folder = Path(__file__).parents[2] / "examples/medallion"
-    method = estimator(refines=True)
+    method = make_estimator("spline-net-pixelwise") if of_package else estimator(refines=True)
     protocol = Protocol(n_lights=None, trials=1, max_pixels=50)
     (result,) = evaluate([folder], [method], protocol).results
     capture = read_capture(folder)
