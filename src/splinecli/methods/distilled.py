@@ -264,6 +264,7 @@ class DistilledEstimator(Estimator):
     """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see distil."""
 
     has_confidence = True
+    needs_capture = True
     tile_pixels = 1 << 20
     """The few rare pixels of a tile still fill several batches of the network."""
 
