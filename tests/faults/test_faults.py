@@ -95,9 +95,10 @@ def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> No
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     )
-    # The lock is taken just before the images are read.
+    # The lock is taken just before the images are read. Before that, the folders are made and removed once as a test.
+    lock = tmp_path / "out" / large.name / ".lock"
     deadline = time.monotonic() + 60
-    while not list((tmp_path / "out").glob("*/.lock")) and time.monotonic() < deadline:
+    while not lock.exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     time.sleep(0.2)
     process.send_signal(signal.SIGINT)
