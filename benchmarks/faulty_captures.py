@@ -1,6 +1,6 @@
 """Render captures, right and faulty ones, and estimate them: examples for benchmarks/fit_capture_confidence.py.
 
-    python benchmarks/faulty_captures.py FOLDER [--scenes 420] [--size 64] [--part 1/2] [--sets SET ...]
+    python benchmarks/faulty_captures.py FOLDER [--scenes 1020] [--size 64] [--part 1/2] [--sets SET ...]
 
 Half of the scenes are rendered here; the others are whole scenes of pixel sets of `splinecli prepare`, which have more
 pixels and more detail. Without --sets, all are rendered here. Each scene becomes three captures of KINDS: right ones,
@@ -311,7 +311,7 @@ def store_captures(folder: Path, scenes: Sequence[int], size: int, sets: Sequenc
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--scenes", type=int, default=420)
+    parser.add_argument("--scenes", type=int, default=1020)
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--part", default="1/1")
     parser.add_argument("--sets", type=Path, nargs="*", default=[])
