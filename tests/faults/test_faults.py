@@ -95,7 +95,8 @@ def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> No
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     )
-    # The lock is taken just before the images are read. Before that, the folders are made and removed once as a test.
+    # The lock is taken just before the images are read. A few milliseconds earlier, the folders and the lock are made
+    # and removed once, to look for earlier results.
     lock = tmp_path / "out" / large.name / ".lock"
     deadline = time.monotonic() + 60
     while not lock.exists() and time.monotonic() < deadline:
