@@ -28,7 +28,7 @@ from figure_tables import FITS, NETWORKS, OBJECTS, RESTORED, SYNTH, Measured
 from splinecli import __version__
 
 if TYPE_CHECKING:
-    from splinecli.inference import NormalEstimate
+    from splinecli.estimate.inference import NormalEstimate
 
 Cells = dict[str, float | str]
 Rows = dict[str, Callable[[], Cells]]
@@ -144,9 +144,9 @@ class Bench:
     def estimates(self, folder: Path, method: str, *, trials: int) -> Iterator[NormalEstimate]:
         """Yield the estimates of a capture under draws of ten lights."""
         from splinecli.capture import open_capture
-        from splinecli.evaluation.protocol import draw_lights
-        from splinecli.inference import estimate_normals
-        from splinecli.methods import make_estimator
+        from splinecli.estimate.inference import estimate_normals
+        from splinecli.estimate.methods import make_estimator
+        from splinecli.lights.draws import draw_lights
 
         source, estimator = open_capture(folder), make_estimator(method)
         for draw in draw_lights(source.light_directions, 10, trials=trials, seed=0):
@@ -161,7 +161,7 @@ class Bench:
     def photographs(self, capture: str) -> Cells:
         """Mean errors of overexposed pixels, and of all under intensities that no file gives."""
         import photographs
-        from splinecli.networks.weights import resolve_weights
+        from splinecli.estimate.networks.weights import resolve_weights
 
         network = resolve_weights("spline-net").network
         draws = photographs.read_draws({**self.objects, **self.synth}[capture], 2, 1500)
@@ -203,8 +203,8 @@ class Bench:
         return {scene: {name: round(error, 4) for name, (error, _) in cells} for scene, cells in rows}
 
     def calibration(self) -> dict[str, Cells]:
-        from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
         from splinecli.capture.light_files import read_light_directions
+        from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
         from splinecli.maths.normals import angle_between_deg
 
         probes = [self.data / f"psbox/LightProbe-{number}" for number in (1, 2)]

@@ -21,15 +21,15 @@ from scipy.optimize import minimize
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
 from splinecli.capture import Capture, open_capture
-from splinecli.diagnosis.checks import check_arrays, check_capture
-from splinecli.diagnosis.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
-from splinecli.diagnosis.summary import Sample
-from splinecli.evaluation.protocol import draw_lights
+from splinecli.capture.sample import Sample
+from splinecli.images.lamps import estimate_light_intensities
+from splinecli.judge.checks import check_arrays, check_capture
+from splinecli.judge.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
+from splinecli.lights.draws import draw_lights
 from splinecli.maths.transfer import encode_srgb
-from splinecli.restoration.lamps import estimate_light_intensities
-from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_direct, render_indirect
+from splinecli.workshop.synthesis.meshes import Mesh
+from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
+from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_direct, render_indirect
 
 Array = NDArray[np.float64]
 WIDTHS = (2.0, 3.0, 4.0, 6.0)

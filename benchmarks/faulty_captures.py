@@ -24,22 +24,22 @@ from point_lights import render_point_lights
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.record import in_one_plane
-from splinecli.inference import estimate_normals
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.estimate.refinement.refiner import NetworkRefiner
+from splinecli.images.lens_blur import REACH
 from splinecli.lights.lighting import LightingAt
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
-from splinecli.methods import make_estimator
-from splinecli.pixel_sets.store import PixelSet, open_pixel_set
-from splinecli.refinement.refiner import NetworkRefiner
-from splinecli.restoration.lens_blur import REACH
-from splinecli.synthesis.batches import CaptureConfig
-from splinecli.synthesis.lights import choose_in_cone
-from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import draw_material, with_one_gloss
-from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.scenes import draw_patches, render_direct, render_indirect
-from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn
-from splinecli.synthesis.whole_capture import photograph_scene
+from splinecli.workshop.pixel_sets.store import PixelSet, open_pixel_set
+from splinecli.workshop.synthesis.batches import CaptureConfig
+from splinecli.workshop.synthesis.draw_materials import draw_material, with_one_gloss
+from splinecli.workshop.synthesis.lights import choose_in_cone
+from splinecli.workshop.synthesis.meshes import Mesh
+from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
+from splinecli.workshop.synthesis.scenes import draw_patches, render_direct, render_indirect
+from splinecli.workshop.synthesis.shapes import draw_rotation, draw_shape, turn
+from splinecli.workshop.synthesis.whole_capture import photograph_scene
 
 Floats = NDArray[np.floating]
 

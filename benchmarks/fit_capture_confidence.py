@@ -19,12 +19,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.confidence import capture_features
+from splinecli.estimate.confidence import capture_features
+from splinecli.estimate.methods.estimator import CONFIDENT_DEG
+from splinecli.estimate.networks.li_ne_net import CaptureHead, error_negative_log_likelihood, probability_within
+from splinecli.estimate.networks.weights import HEAD_FORMAT, manifest
 from splinecli.lights.lighting import PixelIndices, PixelLighting, PixelPlaces
-from splinecli.methods.estimator import CONFIDENT_DEG
-from splinecli.networks.li_ne_net import CaptureHead, error_negative_log_likelihood, probability_within
-from splinecli.networks.weights import HEAD_FORMAT, SHIPPED, manifest, serialise, tensors_sha256
 from splinecli.system.files import file_sha256
+from splinecli.system.weight_files import SHIPPED, serialise, tensors_sha256
 
 Floats = NDArray[np.floating]
 

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.images import lens_blur
 from splinecli.maths import Bools, Float32Array
-from splinecli.networks.spline_net import SplineNet
-from splinecli.pixel_sets.store import open_pixel_set
-from splinecli.restoration import lens_blur
-from splinecli.synthesis import draw_number, stream_seed
-from splinecli.synthesis.batches import add_sensor_noise
-from splinecli.synthesis.whole_capture import add_background, draw_optics
-from splinecli.training import refinement
-from splinecli.training.config import PRESETS
+from splinecli.workshop.pixel_sets.store import open_pixel_set
+from splinecli.workshop.synthesis import draw_number, stream_seed
+from splinecli.workshop.synthesis.batches import add_sensor_noise
+from splinecli.workshop.synthesis.whole_capture import add_background, draw_optics
+from splinecli.workshop.training import refinement
+from splinecli.workshop.training.config import PRESETS
 
 BACKGROUND_SHARE = 0.3
 ENGRAVED_SHARE = 0.08

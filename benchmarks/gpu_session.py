@@ -137,9 +137,9 @@ def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, sa
     import torch
     from splinecli.system.devices import choose_device
 
-    from splinecli.training import tasks
-    from splinecli.training.config import configure
-    from splinecli.training.loop import Trainer
+    from splinecli.workshop.training import tasks
+    from splinecli.workshop.training.config import configure
+    from splinecli.workshop.training.loop import Trainer
 
     tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1
     config, place = configure(preset, None, list(changes)), choose_device(device)
@@ -175,7 +175,7 @@ def moved(value: Any, device: Any) -> Any:
 
 def finish_set(folder: str) -> Row:
     """Finish a pixel set whose rendering was interrupted. Raises RuntimeError if it has too few scenes."""
-    from splinecli.pixel_sets.store import PixelSetWriter
+    from splinecli.workshop.pixel_sets.store import PixelSetWriter
 
     entries = PixelSetWriter(Path(folder)).finish().entries
     shapes = len({entry.scene for entry in entries})
@@ -187,9 +187,9 @@ def finish_set(folder: str) -> Row:
 def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: float) -> Row:
     """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of it at most."""
     from splinecli.cli.console import Messages
-    from splinecli.training import tasks
-    from splinecli.training.config import configure
-    from splinecli.training.loop import open_run
+    from splinecli.workshop.training import tasks
+    from splinecli.workshop.training.config import configure
+    from splinecli.workshop.training.loop import open_run
 
     def minutes_left() -> float:
         return max(0.05, (ends - SPARE_SECONDS - time.time()) / 60)

@@ -17,12 +17,12 @@ from collections.abc import Sequence
 
 import torch
 
-from splinecli.methods.batched import NetworkEstimator, Precision
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import LoadedNetwork, resolve_weights
-from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from splinecli.estimate.methods.batched import NetworkEstimator, Precision
+from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import LoadedNetwork, resolve_weights
 from splinecli.system.machine import choose_precision
+from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 
 def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, repeats: int) -> float:

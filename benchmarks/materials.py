@@ -22,14 +22,14 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.estimate.inference import estimate_normals, lighting_on
+from splinecli.estimate.methods import make_estimator
 from splinecli.evaluation.figures import lambertian, likeness
-from splinecli.inference import estimate_normals, lighting_on
 from splinecli.materials.lobes import Geometry
 from splinecli.materials.maps import estimate_material, lights_that_reach, render_gray
-from splinecli.methods import make_estimator
-from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
+from splinecli.materials.principled import PrincipledMaterial
+from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
+from splinecli.workshop.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
 
 Floats = NDArray[np.float32]
 DRAWN = 10

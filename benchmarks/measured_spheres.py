@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import resolve_weights
-from splinecli.synthesis.pixels import draw_visible_normals
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.workshop.synthesis.pixels import draw_visible_normals
 
 N_LIGHTS = 10
 _IMPLAUSIBLE = ("black-obsidian", "brass", "chrome-steel", "grease-covered-steel", "ss440")

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from point_lights import render_point_lights
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.inference import NormalEstimate, estimate_normals
-from splinecli.methods import make_estimator
+from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.materials.principled import PrincipledMaterial
 from splinecli.surface.integration import integrate_normals
-from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import Tracer, VisibleSurface, find_visible_surface
-from splinecli.synthesis.scenes import render_direct
+from splinecli.workshop.synthesis.meshes import Mesh
+from splinecli.workshop.synthesis.ray_tracing import Tracer, VisibleSurface, find_visible_surface
+from splinecli.workshop.synthesis.scenes import render_direct
 
 # Angles of the ten lamps from the viewing direction and azimuths in degrees, as placed by hand.
 LAMPS_DEG = (

@@ -18,13 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
-from splinecli.evaluation.protocol import draw_lights
+from splinecli.estimate.networks.set_branch import sample_of
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.images.lamps import estimate_light_intensities
+from splinecli.images.saturation import restore_saturated
+from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg
-from splinecli.networks.set_branch import sample_of
-from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import resolve_weights
-from splinecli.restoration.images import restore_saturated
-from splinecli.restoration.lamps import estimate_light_intensities
 
 N_LIGHTS = 10
 OVEREXPOSED = 0.2

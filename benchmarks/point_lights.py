@@ -5,9 +5,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.synthesis.meshes import Floats
-from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer, VisibleSurface
-from splinecli.synthesis.scenes import Materials, before_black
+from splinecli.workshop.synthesis.meshes import Floats
+from splinecli.workshop.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer, VisibleSurface
+from splinecli.workshop.synthesis.scenes import Materials, before_black
 
 
 def render_point_lights(

@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.synthesis.principled import CLASSES, PrincipledMaterial
-from splinecli.synthesis.scenes import Scene, SceneConfig, draw_scene, render_scene
+from splinecli.materials.principled import PrincipledMaterial
+from splinecli.workshop.synthesis.draw_materials import CLASSES
+from splinecli.workshop.synthesis.scenes import Scene, SceneConfig, draw_scene, render_scene
 
 LEVELS = 6
 # Cosines of the lights with the viewing direction, and their azimuths in degrees.

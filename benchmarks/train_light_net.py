@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from splinecli.networks.light_net import LightNet, network_inputs, square_images
-from splinecli.networks.weights import LIGHT_FORMAT, save_module
-from splinecli.synthesis import draw_number, shapes
-from splinecli.synthesis.lights import choose_in_cone, draw_light_directions
-from splinecli.synthesis.meshes import Mesh, ellipsoid, fit_to_frame, smooth_union, triangulate
-from splinecli.synthesis.principled import CLASSES
-from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
-from splinecli.synthesis.whole_capture import add_background
+from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
+from splinecli.system.weight_files import save_module
+from splinecli.workshop.synthesis import draw_number, shapes
+from splinecli.workshop.synthesis.draw_materials import CLASSES
+from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
+from splinecli.workshop.synthesis.meshes import Mesh, ellipsoid, fit_to_frame, smooth_union, triangulate
+from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.whole_capture import add_background
 
 CONFIG = SceneConfig(size=72, lights=64, samples=2, directions=24, bounces=2)
 SPACING, FEWEST_FACES = 0.025, 1500  # coarser than other scenes: the network sees 48 pixels

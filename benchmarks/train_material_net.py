@@ -20,15 +20,16 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
-from splinecli.networks.material_net import Gloss, MaterialNet
-from splinecli.networks.set_branch import PixelTokens
-from splinecli.networks.weights import MATERIAL_FORMAT, SHIPPED, resolve_weights, save_module
-from splinecli.synthesis import draw_uniform
-from splinecli.synthesis.batches import PixelBatch
-from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
-from splinecli.synthesis.pixels import PixelGeneratorConfig, PixelScene, draw_scene
-from splinecli.synthesis.whole_capture import photograph_captures
+from splinecli.estimate.networks.set_branch import PixelTokens
+from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.materials.material_net import MATERIAL_FORMAT, Gloss, MaterialNet
 from splinecli.system.files import file_sha256
+from splinecli.system.weight_files import SHIPPED, save_module
+from splinecli.workshop.synthesis import draw_uniform
+from splinecli.workshop.synthesis.batches import PixelBatch
+from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.workshop.synthesis.pixels import PixelGeneratorConfig, PixelScene, draw_scene
+from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
 BATCHES, CAPTURES, PIXELS = 64, 8, 256  # of a shard, of a batch, and of a capture
 SPHERES = 24  # number of shards whose captures have the normals of spheres

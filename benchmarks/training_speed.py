@@ -17,9 +17,9 @@ from typing import Any
 import torch
 
 from splinecli.system.machine import choose_device
-from splinecli.training.config import PRESETS, configure
-from splinecli.training.loop import Trainer
-from splinecli.training.tasks import PixelTask
+from splinecli.workshop.training.config import PRESETS, configure
+from splinecli.workshop.training.loop import Trainer
+from splinecli.workshop.training.tasks import PixelTask
 
 LOSSES = {"symmetric_weight": 2e-2, "asymmetric_weight": 2e-5}
 

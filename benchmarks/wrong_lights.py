@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
 from splinecli.capture.light_rows import parse_light_frame
-from splinecli.diagnosis.light_check import LightCheck, check_lights, mirror_twin
-from splinecli.diagnosis.light_order import UNKNOWN_ORDER
-from splinecli.diagnosis.summary import sample_observations
-from splinecli.evaluation.protocol import draw_lights
+from splinecli.judge.light_check import LightCheck, check_lights, mirror_twin
+from splinecli.judge.light_order import UNKNOWN_ORDER
+from splinecli.judge.summary import sample_observations
+from splinecli.lights.draws import draw_lights
 from splinecli.lights.light_fit import find_factors
-from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
 Array = NDArray[np.floating]
 FRAMES = {

@@ -9,9 +9,9 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from splinecli.capture_warnings import WARNINGS
-from splinecli.methods import METHODS
-from splinecli.output_files import MAPS
+from splinecli.estimate.methods import METHODS
+from splinecli.records.capture_warnings import WARNINGS
+from splinecli.records.output_files import MAPS
 
 DOCS = Path(__file__).resolve().parent
 PAGES = ("warnings.md", "compared_methods.md", "results.md")

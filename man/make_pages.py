@@ -13,8 +13,8 @@ import typer
 
 from splinecli import __version__
 from splinecli.cli.main import app
-from splinecli.documents import json_schema
-from splinecli.output_files import MAPS
+from splinecli.records.documents import json_schema
+from splinecli.records.output_files import MAPS
 
 EXIT_STATUS = {
     "0": "Done.",

@@ -35,7 +35,7 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Save training runs without drawing the figures, which takes longer than the run itself."""
-    monkeypatch.setattr("splinecli.training.run_files.RunLog.draw", lambda self, maps: None)
+    monkeypatch.setattr("splinecli.workshop.training.run_files.RunLog.draw", lambda self, maps: None)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.estimator import Estimator
+from splinecli.estimate.methods.estimator import Estimator
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import DTypeLike
 
-from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 
 MakeSet = Callable[..., PixelSet]
 THREE_SCENES = (("a", "one", 40, 30), ("b", "two", 30, 25), ("c", "three", 20, 12))

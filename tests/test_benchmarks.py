@@ -15,9 +15,9 @@ import torch
 
 from small_pixel_sets import MakeSet
 from splinecli import __version__
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import save_weights
+from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
@@ -38,8 +38,8 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 @pytest.fixture
 def coarse_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawn shapes of few triangles, which small pictures show as well."""
-    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
-    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
 
 
 def numbers(line: str) -> list[float]:

@@ -18,9 +18,9 @@ import pytest
 
 from splinecli.capture import read_capture
 from splinecli.cli.main import main
-from splinecli.inference import estimate_normals
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import angle_between_deg, encode_picture, unit
-from splinecli.methods import make_estimator
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MEDALLION = EXAMPLES / "medallion"

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 import splinecli
 from scenes import spiral_lights
-from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.linearise import Window
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import InputError, UsageError
-from splinecli.inference import Blocks, estimate_normals, find_surface
+from splinecli.estimate import inference
+from splinecli.estimate.inference import Blocks, estimate_normals, find_surface
+from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import unit
-from splinecli.methods import make_estimator
-from splinecli.surface.pixel_grid import pixel_rays
+from splinecli.maths.pixel_grid import pixel_rays
 
 Floats = NDArray[np.float64]
 SIDE = 40

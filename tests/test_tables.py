@@ -1,9 +1,7 @@
 """Methods, maps and warnings are rows of tables: one row adds one everywhere, and nothing tests for it by name."""
 
 import re
-import sys
 from pathlib import Path
-from pkgutil import resolve_name
 
 import numpy as np
 import pytest
@@ -15,15 +13,17 @@ import splinecli
 from html_page import REPORT
 from splinecli.capture import Capture
 from splinecli.capture.files import NOT_PHOTOGRAPHS
-from splinecli.capture_warnings import WARNINGS, CaptureWarning, WarningKind
 from splinecli.cli.main import app
-from splinecli.diagnosis import checks
 from splinecli.errors import InputError
-from splinecli.inference import NormalEstimate, estimate_normals
-from splinecli.methods import METHODS, Estimator, Method, make_estimator, method_names
-from splinecli.output_files import MAPS, OutputMap, own_files
+from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.methods import METHODS, Estimator, Method, make_estimator, method_names
+from splinecli.judge import checks
+from splinecli.pictures.maps import signed_picture
 from splinecli.pipeline.infer import results_bytes
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.records.capture_warnings import WARNINGS, CaptureWarning, WarningKind
+from splinecli.records.output_files import MAPS, OutputMap, own_files
+from splinecli.results.map_values import MAP_FUNCTIONS, MapFunctions
 from splinecli.results.maps import chosen_maps, make_map, map_files
 from splinecli.results.pages import result_page
 
@@ -89,7 +89,6 @@ def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     row = OutputMap(
         name="slant",
-        make="test_tables:slant",
         content="cosine between normal and camera axis",
         unit="cosine",
         scale=1.0,
@@ -99,7 +98,7 @@ def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     InferOptions()  # so that the new row does not enter the help, which other tests compare
     monkeypatch.setitem(MAPS, "slant", row)
-    monkeypatch.setitem(sys.modules, "test_tables", sys.modules[__name__])
+    monkeypatch.setitem(MAP_FUNCTIONS, "slant", MapFunctions(slant, signed_picture))
     mask, estimate = np.ones((2, 3), np.bool_), estimate_normals(capture(), make_estimator("ls"))
     assert chosen_maps(["slant", "preview"])[-1] is row
     assert row in chosen_maps([], page=True)
@@ -123,6 +122,5 @@ def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray
 
 @pytest.mark.parametrize("row", MAPS.values(), ids=list(MAPS))
 def test_functions_of_the_maps_exist(row: OutputMap) -> None:
-    assert callable(resolve_name(row.make))
-    assert "png" not in row.suffixes or callable(resolve_name(row.picture))
+    assert {row.name, *(part.name for part in row.parts)} <= MAP_FUNCTIONS.keys()
     assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == ("npy",)

@@ -4,8 +4,8 @@ from typing import Any
 
 import torch
 
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet
+from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.spline_net import SplineNet
 
 TINY: dict[str, Any] = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16}
 

@@ -25,7 +25,7 @@ class SplinecliError(Exception):
 
     Examples:
         >>> from splinecli.errors import SplinecliError
-        >>> from splinecli.methods import make_estimator
+        >>> from splinecli.estimate.methods import make_estimator
         >>> try:
         ...     make_estimator("photoshop")
         ... except SplinecliError as error:

@@ -16,18 +16,18 @@ import tifffile
 from PIL import Image
 
 import scenes
-from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
-from splinecli.diagnosis.capture_sample import CaptureSample
-from splinecli.diagnosis.checks import check_sample
-from splinecli.diagnosis.summary import summarise_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.inference import estimate_normals
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.judge.capture_sample import CaptureSample
+from splinecli.judge.checks import check_sample
+from splinecli.judge.summary import summarise_capture
+from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.transfer import encode_srgb
-from splinecli.methods import make_estimator
 
 SIZE = 32
 LIGHTS = scenes.spiral_lights(12, 40)

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import ring_lights, shade, sphere, write_capture
-from splinecli.calibration.balls import find_ball_files
-from splinecli.calibration.crosstalk import measure_crosstalk
 from splinecli.capture.channel_lights import channel_lights
 from splinecli.errors import InputError, UsageError
+from splinecli.lights.calibration.balls import find_ball_files
+from splinecli.lights.calibration.crosstalk import measure_crosstalk
 from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading

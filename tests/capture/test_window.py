@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from splinecli.capture import open_capture
 from splinecli.capture.linearise import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.inference import lighting_on
+from splinecli.estimate.inference import lighting_on
 from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
+from splinecli.maths.pixel_grid import pixel_rays
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
-from splinecli.surface.pixel_grid import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]

@@ -11,7 +11,7 @@ import pytest
 
 import splinecli
 from scenes import shade, sphere, spiral_lights, write_capture
-from splinecli.diagnosis import checks
+from splinecli.judge import checks
 from test_notebook import read_medallion
 
 

@@ -15,7 +15,7 @@ from cli.test_schema import check
 from splinecli.cli import console
 from splinecli.cli.console import Messages, explain
 from splinecli.cli.main import app
-from splinecli.records import PANELS
+from splinecli.records.base import PANELS
 
 
 def test_every_option_stands_in_a_panel():

@@ -157,7 +157,7 @@ def test_figures(dataset, run):
 
 
 def test_all_methods_by_one_word(dataset, run):
-    from splinecli.methods import method_names
+    from splinecli.estimate.methods import method_names
 
     options = ("--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json")
     result = run("evaluate", dataset / "matte", *options)

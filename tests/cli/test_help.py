@@ -14,12 +14,11 @@ import typer
 
 from make_pages import EXAMPLES, FILES, man_pages
 from splinecli.cli.main import app
-from splinecli.methods import method_names
-from splinecli.networks.weights import shipped_names
-from splinecli.output_files import MAPS, NORMALS, own_files
+from splinecli.estimate.methods import method_names
+from splinecli.estimate.networks.weights import shipped_names
+from splinecli.records.output_files import MAPS, NORMALS, SURFACE_FILES, own_files
 from splinecli.results.pages import INDEX
-from splinecli.surface.surface_files import SURFACE_FILES
-from splinecli.training.config import PRESETS
+from splinecli.workshop.training.config import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMMANDS = ["infer", "watch", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]

@@ -16,10 +16,9 @@ import tifffile
 
 from cli.conftest import EXAMPLE, read_report
 from splinecli.capture.files import IMAGE_SUFFIXES
+from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg, decode_picture
-from splinecli.methods.estimator import LeastSquares
-from splinecli.output_files import ERROR_MAP, FOUND_MASK, LIGHT_PLOT, MAPS, NORMALS, PLOTS
-from splinecli.surface.surface_files import SURFACE_FILES
+from splinecli.records.output_files import ERROR_MAP, FOUND_MASK, LIGHT_PLOT, MAPS, NORMALS, PLOTS, SURFACE_FILES
 
 
 def test_writes_the_contract(capture, truth, run, golden):

@@ -16,7 +16,7 @@ import pytest
 from capture.test_cyclesps import write_object
 from cli.conftest import read_report
 from splinecli.errors import InputError, UsageError
-from splinecli.methods.estimator import LeastSquares
+from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.pipeline.batch import infer_batch, list_captures, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, Shard

@@ -131,8 +131,8 @@ def cube() -> Path:
 
 def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     # Coarser shapes, for speed.
-    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
-    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
     arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
     assert result.code == 0 and result.out.startswith("set: 18 entries of 2 scenes, ")

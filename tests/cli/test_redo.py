@@ -12,7 +12,7 @@ import pytest
 
 from cli.conftest import read_report
 from splinecli.cli import infer as watch
-from splinecli.networks.weights import save_weights
+from splinecli.estimate.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.files import UNFINISHED

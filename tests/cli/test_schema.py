@@ -7,8 +7,8 @@ from typing import Any
 import jsonschema
 import pytest
 
-from splinecli.capture_warnings import WARNINGS
-from splinecli.documents import json_schema
+from splinecli.records.capture_warnings import WARNINGS
+from splinecli.records.documents import json_schema
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
 

@@ -12,14 +12,14 @@ import pytest
 from small_pixel_sets import matte_pixels
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
-from splinecli.training.run_files import RunLog
+from splinecli.workshop.training.run_files import RunLog
 
 
 @pytest.fixture(autouse=True)
 def small_runs(monkeypatch):
     """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
-    from splinecli.networks.config import NetworkConfig
-    from splinecli.training import config, tasks
+    from splinecli.estimate.networks.config import NetworkConfig
+    from splinecli.workshop.training import config, tasks
 
     tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
@@ -40,7 +40,7 @@ def settings() -> dict[str, Any]:
 
 def write_set(folder: str, *, finished: bool = True) -> None:
     """Matte pixels in three scenes under 14 lights."""
-    from splinecli.pixel_sets.store import PixelSetWriter
+    from splinecli.workshop.pixel_sets.store import PixelSetWriter
 
     writer = PixelSetWriter(Path(folder))
     for seed, scene in enumerate("abc"):
@@ -117,7 +117,7 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
 
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
-    from splinecli.training import loop as training_run
+    from splinecli.workshop.training import loop as training_run
 
     monkeypatch.setattr(training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device))
     result = run("train", "-o", "run", "--steps", 1)
@@ -128,7 +128,7 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
 
 def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
-    monkeypatch.setattr("splinecli.training.loop.restarts_are_allowed", lambda: True)
+    monkeypatch.setattr("splinecli.workshop.training.loop.restarts_are_allowed", lambda: True)
     assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
     assert steps() == ["3", "5"]
     # Without a checkpoint, a run starts.

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from scenes import evaluate, shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.protocol import Protocol, draw_lights, read_draws
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.evaluation.protocol import Protocol, read_draws
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
-from splinecli.inference import estimate_normals
+from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import unit
-from splinecli.methods import make_estimator
-from splinecli.restoration.images import WhiteLevel
+from splinecli.records.white_level import WhiteLevel
 
 
 def random_lights(n_lights: int, seed: int = 0) -> np.ndarray:

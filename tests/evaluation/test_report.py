@@ -11,9 +11,9 @@ import pytest
 
 from html_page import HtmlPage
 from splinecli import __version__
-from splinecli.documents import SkippedCapture
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
+from splinecli.records.documents import SkippedCapture
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splinecli.documents import SkippedCapture
 from splinecli.evaluation.document import html_report, results_csv, results_document
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.tables import AVERAGE, best_cells, compare, holm, latex, markdown, table_rows, trial_averages
+from splinecli.records.documents import SkippedCapture
 
 TEN = Evaluation(
     Protocol(n_lights=10, trials=2, seed=7, max_pixels=500),

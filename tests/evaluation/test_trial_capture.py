@@ -6,8 +6,8 @@ import pytest
 from splinecli.capture import Capture
 from splinecli.capture.record import StoredCapture
 from splinecli.evaluation.trials import scored_rows, tilt_lights
+from splinecli.images.saturation import Saturation
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.restoration.images import Saturation
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
 MASK = np.random.default_rng(5).random((9, 7)) < 0.7

@@ -15,8 +15,8 @@ import pytest
 from kills import content
 from scenes import write_capture
 from splinecli.errors import InputError
+from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
-from splinecli.methods.estimator import LeastSquares
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.publishing import held_folder

@@ -189,9 +189,9 @@ def two_captures(folder: Path) -> None:
 def weights(folder: Path) -> None:
     import torch
 
-    from splinecli.networks.config import NetworkConfig
-    from splinecli.networks.spline_net import SplineNet
-    from splinecli.networks.weights import save_weights
+    from splinecli.estimate.networks.config import NetworkConfig
+    from splinecli.estimate.networks.spline_net import SplineNet
+    from splinecli.estimate.networks.weights import save_weights
 
     torch.manual_seed(0)
     config = NetworkConfig(map_size=8, width=2, li_blocks=1, ne_blocks=1, head_width=4, fits=("ls",))
@@ -205,7 +205,7 @@ def weights(folder: Path) -> None:
 def training(folder: Path) -> None:
     """A finished run, a pixel set, and settings: reading them takes no training step."""
     from small_pixel_sets import matte_pixels
-    from splinecli.pixel_sets.store import PixelSetWriter
+    from splinecli.workshop.pixel_sets.store import PixelSetWriter
 
     writer = PixelSetWriter(folder / "set")
     for name in "ab":

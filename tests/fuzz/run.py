@@ -162,8 +162,8 @@ def prepare_process() -> None:
     import torch
     import typer
 
-    from splinecli.synthesis import meshes
-    from splinecli.training import run_files, tasks
+    from splinecli.workshop.synthesis import meshes
+    from splinecli.workshop.training import run_files, tasks
 
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

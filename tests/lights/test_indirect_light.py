@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.inference import estimate_normals
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import MethodOptions, make_estimator
+from splinecli.estimate.networks.refine_net import channels
+from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.lights import lighting
 from splinecli.lights.lighting import IndirectLight, PixelLighting, find_indirect_light
 from splinecli.maths.normals import angle_between_deg
-from splinecli.methods import MethodOptions, make_estimator
-from splinecli.networks.refine_net import channels
-from splinecli.refinement.refiner import NetworkRefiner
-from splinecli.training.refinement import pixel_features
+from splinecli.workshop.training.refinement import pixel_features
 
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)

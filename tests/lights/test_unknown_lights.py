@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from scenes import cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
 from splinecli import estimate_normals
-from splinecli.capture_warnings import ESTIMATED_LIGHTS
-from splinecli.confidence import add_common_error
 from splinecli.errors import InputError, UsageError
+from splinecli.estimate.confidence import add_common_error
 from splinecli.lights import unknown_lights
 from splinecli.lights.unknown_lights import (
     bump_log_odds,
@@ -20,6 +19,7 @@ from splinecli.lights.unknown_lights import (
     turn_at_outline,
 )
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.records.capture_warnings import ESTIMATED_LIGHTS
 
 SIZE = 64
 NORMALS, INSIDE = sphere(SIZE)

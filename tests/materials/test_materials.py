@@ -14,22 +14,22 @@ from scenes import cap_directions, sphere, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
 from splinecli.evaluation.figures import likeness
-from splinecli.inference import estimate_normals
 from splinecli.lights.lighting import PixelLighting
 from splinecli.materials import maps
 from splinecli.materials.maps import MaterialMaps, render_gray
-from splinecli.methods import make_estimator
-from splinecli.networks.weights import material_networks
-from splinecli.output_files import MAPS
+from splinecli.materials.material_net import material_networks
 from splinecli.pipeline.evaluate import evaluate_captures
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
+from splinecli.records.output_files import MAPS
 from splinecli.results.maps import make_map, map_files
 from splinecli.results.material import material_facts, material_warnings
-from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 SIZE = 48
 LIGHTS = cap_directions(12, 60, seed=4, even=True)
@@ -248,7 +248,7 @@ def test_a_black_capture_has_some_material(tmp_path):
 def test_a_rendered_scene(tmp_path):
     """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is wrong by 0.24."""
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+    from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
     config = SceneConfig(size=32, lights=12, samples=2, directions=8, bounces=1)
     scene = draw_scene(7100, 3, config)

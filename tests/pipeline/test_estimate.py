@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scenes import Teacher, cap_directions, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
-from splinecli.methods.estimator import LeastSquares, StudentSize
-from splinecli.output_files import MAPS
+from splinecli.estimate.methods.estimator import LeastSquares, StudentSize
+from splinecli.estimate.refinement.refiner import MARGIN, TILE
 from splinecli.pipeline import infer
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.infer import AUTOMATIC_FROM, REFINED_PIXELS, distil_for
 from splinecli.pipeline.info import ORIGINS
-from splinecli.refinement.refiner import MARGIN, TILE
-from splinecli.restoration.images import Origin
+from splinecli.records.output_files import MAPS
+from splinecli.records.white_level import Origin
 
 LIGHTS = spiral_lights(6, 40)
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from scenes import square_grid, write_capture
-from splinecli.calibration.balls import find_ball_files
-from splinecli.calibration.lamps import measure_light_intensities
 from splinecli.capture import open_capture
-from splinecli.results.maps import albedo_map
+from splinecli.lights.calibration.balls import find_ball_files
+from splinecli.lights.calibration.lamps import measure_light_intensities
+from splinecli.results.map_values import albedo_map
 
 SIZE = 40
 INTENSITIES = np.array([(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)])

@@ -25,8 +25,8 @@ from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.materials.lobes import GGX, Geometry, diffuse_lobe, facet_lobe
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import decode_transfer, encode_srgb
-from splinecli.output_files import NORMALS
 from splinecli.pictures.maps import albedo_picture
+from splinecli.records.output_files import NORMALS
 from splinecli.results import pages as page_module
 from splinecli.results.pages import Entry, Row, index_page, result_page
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from glb_file import read_glb
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.pixel_grid import Blocks
 from splinecli.surface import mesh as mesh_module
 from splinecli.surface.mesh import SurfaceMesh, decimated_mesh, surface_mesh
-from splinecli.surface.pixel_grid import Blocks
 from splinecli.surface.surface_files import Surface, encode_surface
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])

@@ -9,7 +9,7 @@ from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.capture.reader import capture_from_arrays, open_capture, read_capture
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource
-from splinecli.capture_warnings import CaptureWarning
+from splinecli.records.capture_warnings import CaptureWarning
 
 __all__ = [
     "Capture",

@@ -18,9 +18,9 @@ from splinecli.capture.formats.decoders import RAW_SUFFIXES, page_of, pages
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import cut_out, decode_with_alpha
 from splinecli.capture.formats.numbers import read_lines, read_text
-from splinecli.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.errors import InputError
-from splinecli.output_files import FOUND_LIGHTS, PLOTS, own_files
+from splinecli.records.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
+from splinecli.records.output_files import FOUND_LIGHTS, PLOTS, own_files
 from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")

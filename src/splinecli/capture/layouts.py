@@ -14,8 +14,8 @@ from pathlib import Path
 from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
-from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError
+from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath, is_folder, resolve
 
 _PREFIX = "images_"

@@ -21,7 +21,7 @@ from splinecli.capture.formats.numbers import NumberRows, Row, to_number
 from splinecli.capture.light_rows import INTENSITIES, RowForm, image_name, usable_intensities
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
-from splinecli.records import Positive
+from splinecli.records.base import Positive
 from splinecli.system.files import parse_json
 
 

@@ -12,16 +12,16 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli import capture_warnings as codes
 from splinecli.capture.formats.facts import ImageHeader
 from splinecli.capture.formats.images import ExpectedSize, decode_image, to_linear
-from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
+from splinecli.images.lamps import COLOUR_SAMPLE, lamp_colours
+from splinecli.images.lens_blur import remove_blur
+from splinecli.images.saturation import ImageValues, Saturation, look_at, white_level_warnings
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
-from splinecli.restoration.images import ImageValues, Saturation, look_at, white_level_warnings
-from splinecli.restoration.lamps import COLOUR_SAMPLE, lamp_colours
-from splinecli.restoration.lens_blur import remove_blur
+from splinecli.records import capture_warnings as codes
+from splinecli.records.capture_warnings import CaptureWarning
 
 Numbers = TypeVar("Numbers", bound=np.generic)
 

@@ -21,11 +21,11 @@ from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_n
 from splinecli.capture.light_files import FORMATS, find_lights, format_of, read_light_positions
 from splinecli.capture.light_rows import LightFrame, read_light_rows
 from splinecli.capture.linearise import Window
-from splinecli.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.surface.pixel_grid import ray_basis
+from splinecli.maths.pixel_grid import ray_basis
+from splinecli.records.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.system.files import is_substitution
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splinecli import capture_warnings as codes
 from splinecli.capture import linearise, near_lamps
 from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
 from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_content, stamp_files
@@ -27,11 +26,12 @@ from splinecli.capture.light_files import (
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeholders
 from splinecli.capture.source import CaptureSource, Progress
-from splinecli.capture_warnings import CaptureWarning
 from splinecli.errors import InputError, UsageError
+from splinecli.images.lens_blur import surroundings
+from splinecli.images.saturation import check_white_level
 from splinecli.maths import Array, Float64Array
-from splinecli.restoration.images import check_white_level
-from splinecli.restoration.lens_blur import surroundings
+from splinecli.records import capture_warnings as codes
+from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath
 
 EQUAL = "equal"  # given instead of a file of intensities: all lights have the same intensity

@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.errors import InputError, UsageError
+from splinecli.images.lamps import estimate_light_intensities
+from splinecli.images.saturation import Saturation, restore_saturated
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
-from splinecli.restoration.images import Saturation, WhiteLevel, restore_saturated
-from splinecli.restoration.lamps import estimate_light_intensities
-from splinecli.surface.pixel_grid import ray_basis
+from splinecli.maths.pixel_grid import ray_basis
+from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.records.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
+from splinecli.records.white_level import WhiteLevel
 
 _SIDES = ("right", "upper-right", "above", "upper-left", "left", "lower-left", "below", "lower-right")
 SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}  # azimuths, counter-clockwise from the right
@@ -54,7 +56,6 @@ def placeholders(n_lights: int) -> Float64Array:
 LightFinder = Callable[[Float32Array, Bools, bool], FoundLights]
 """Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""
 
-MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 _UNIT_TOLERANCE = 1e-3
 _DTYPES: dict[type[np.generic], tuple[str, ...]] = {
     np.float32: ("observations", "ground_truth"),

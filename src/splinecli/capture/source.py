@@ -28,15 +28,8 @@ from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import AS_STORED, WHOLE, RadiometricCalibration, StoredPixels, Window
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
 from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
-from splinecli.capture_warnings import (
-    GROUND_TRUTH_UPSIDE_DOWN,
-    IMAGES_ALIGNED,
-    CaptureWarning,
-    mask_inverted,
-)
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
-from splinecli.restoration.alignment import (
+from splinecli.images.alignment import (
     LARGEST_MOTION,
     MIN_IMAGES,
     AlignedImages,
@@ -47,8 +40,15 @@ from splinecli.restoration.alignment import (
     resample,
     stride_for,
 )
-from splinecli.restoration.images import find_object, looks_inverted, surrounds_hole
-from splinecli.restoration.lens_blur import surroundings
+from splinecli.images.lens_blur import surroundings
+from splinecli.images.saturation import find_object, looks_inverted, surrounds_hole
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
+from splinecli.records.capture_warnings import (
+    GROUND_TRUTH_UPSIDE_DOWN,
+    IMAGES_ALIGNED,
+    CaptureWarning,
+    mask_inverted,
+)
 from splinecli.system.machine import in_order
 
 Item = TypeVar("Item")

@@ -7,22 +7,16 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from splinecli import training
 from splinecli.cli.console import Messages, print_report
 from splinecli.errors import InputError, OutputError, printable
+from splinecli.workshop import training
 
 if TYPE_CHECKING:
     from splinecli.evaluation.protocol import Evaluation
-    from splinecli.pipeline.options import (
-        CalibrateOptions,
-        EvaluateOptions,
-        ImportOptions,
-        IntegrateOptions,
-        PrepareOptions,
-        TrainOptions,
-    )
-    from splinecli.training.loop import Trainer
-    from splinecli.training.run_files import Metrics
+    from splinecli.pipeline.options import CalibrateOptions, EvaluateOptions, IntegrateOptions
+    from splinecli.workshop.options import ImportOptions, PrepareOptions, TrainOptions
+    from splinecli.workshop.training.loop import Trainer
+    from splinecli.workshop.training.run_files import Metrics
 
 
 def calibrate(options: CalibrateOptions) -> None:
@@ -129,7 +123,7 @@ def prepare(options: PrepareOptions) -> int:
     the extra 'render'.
     """
     from splinecli.pipeline.batch import worst_exit_code
-    from splinecli.pipeline.prepare import prepare_pixel_set
+    from splinecli.workshop.prepare import prepare_pixel_set
 
     summary = prepare_pixel_set(options, Messages(quiet=options.quiet))
     in_words = (
@@ -152,7 +146,8 @@ def import_weights(options: ImportOptions) -> None:
     if output.exists() and not options.overwrite:
         raise OutputError("exists already", path=output, hint="Add --overwrite, or choose another place with -o")
 
-    from splinecli.networks.weights import import_official, save_weights
+    from splinecli.estimate.networks.weights import save_weights
+    from splinecli.workshop.import_weights import import_official
 
     save_weights(import_official(options.li_net, options.ne_net), output)
     if not options.quiet:
@@ -167,8 +162,8 @@ def train(options: TrainOptions) -> None:
     curves.png and maps.png into RUN. After Ctrl-C, --resume continues from the checkpoint. Settings come from the
     preset, then from --config, then from the other options. With torchrun, several processes train together.
     """
-    from splinecli.training.config import parse_parameter, parse_sources
-    from splinecli.training.loop import configure_run, open_run
+    from splinecli.workshop.training.config import parse_parameter, parse_sources
+    from splinecli.workshop.training.loop import configure_run, open_run
 
     changes: list[dict[str, Any]] = []  # in the order of their precedence
     if options.sets or options.generator_weight is not None:

@@ -17,7 +17,7 @@ from typing import Any
 import typer
 
 from splinecli.errors import SplinecliError, UsageError, printable
-from splinecli.records import listed
+from splinecli.records.base import listed
 from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer, ignore

@@ -94,7 +94,7 @@ def _show_all(
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:
-    from splinecli.capture_warnings import PROBABLY_WRONG
+    from splinecli.records.capture_warnings import PROBABLY_WRONG
 
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
     scored = ""
@@ -162,8 +162,8 @@ def info(reading: Reading, options: InfoOptions) -> int:
     the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing
     but the plot and the mended lights.
     """
-    from splinecli.capture_warnings import PROBABLY_WRONG
     from splinecli.pipeline.info import describe_capture, summary_lines
+    from splinecli.records.capture_warnings import PROBABLY_WRONG
 
     messages = Messages(quiet=options.quiet)
     report = describe_capture(options, reading, messages)

@@ -26,12 +26,22 @@ from typer import Argument, Context
 from typer import Option as TyperOption
 from typer.core import TyperCommand, TyperGroup
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
 from splinecli.cli.console import DEFECT, Messages, ParserError, error_document, explain, print_lines, printed_documents
 from splinecli.cli.infer import infer, info, watch
 from splinecli.cli.signals import INTERRUPTED, TOLD
-from splinecli.records import PANELS, Option, Record, complete_list, field_types, long_name, number_of, option_of, plain
+from splinecli.records.base import (
+    PANELS,
+    Option,
+    Record,
+    complete_list,
+    field_types,
+    long_name,
+    number_of,
+    option_of,
+    plain,
+)
 from splinecli.system.machine import check_address_space, keep_freed_memory
 
 
@@ -118,7 +128,8 @@ INFER, JSON = "infer", "--json"  # the command whose JSON is a list of documents
 
 _FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
     "splinecli.pipeline.infer_options": (infer, watch, info),
-    "splinecli.pipeline.options": (calibrate, integrate, evaluate, prepare, train, import_weights),
+    "splinecli.pipeline.options": (calibrate, integrate, evaluate),
+    "splinecli.workshop.options": (prepare, train, import_weights),
 }
 COMMANDS = {each.__name__.replace("_", "-"): (each, module) for module, part in _FUNCTIONS.items() for each in part}
 """Name of a command -> its function, and the module that declares its options."""

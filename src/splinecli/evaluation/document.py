@@ -13,15 +13,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from splinecli import __version__
-from splinecli.documents import ComparisonReport, MethodResult, ProtocolReport, RelightingReport
+from splinecli._version import __version__
 from splinecli.errors import printable
 from splinecli.evaluation import protocol as protocol_module
 from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.tables import AVERAGE, compare, table_rows
-from splinecli.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
+from splinecli.records.documents import ComparisonReport, MethodResult, ProtocolReport, RelightingReport
+from splinecli.records.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
 

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.documents import Likeness, RelightingReport
 from splinecli.errors import UsageError, printable
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import METHODS, Estimator
 from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.run import read_first_draw
 from splinecli.evaluation.tables import AVERAGE, trial_averages
-from splinecli.inference import estimate_normals
 from splinecli.maths import Float32Array, Floats
-from splinecli.methods import METHODS, Estimator
 from splinecli.pictures.plots import method_maps, method_styles, observation_map_figure, png_bytes
-from splinecli.results.maps import agreeing_lights
+from splinecli.records.documents import Likeness, RelightingReport
+from splinecli.results.map_values import agreeing_lights
 from splinecli.results.material import material_of
 from splinecli.system.files import free_name
 

@@ -13,14 +13,13 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
 from splinecli.capture.files import digest
-from splinecli.capture.record import MIN_LIGHTS, StoredCapture
-from splinecli.documents import SkippedCapture
+from splinecli.capture.record import StoredCapture
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation import protocol as protocol_module
-from splinecli.evaluation.protocol import Draw, DrawsFile, Evaluation, Protocol, Result
+from splinecli.estimate.methods import Estimator
+from splinecli.evaluation.protocol import EVERY_CAPTURE, DrawsFile, Evaluation, Protocol, Result, read_draws
 from splinecli.evaluation.tables import AVERAGE
 from splinecli.evaluation.trials import (
     CaptureReading,
@@ -32,8 +31,10 @@ from splinecli.evaluation.trials import (
     TrialStore,
     open_to_score,
 )
+from splinecli.lights.draws import Draw, draw_lights
 from splinecli.lights.light_fit import check_distant
-from splinecli.methods import Estimator
+from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.records.documents import SkippedCapture
 
 
 @dataclass
@@ -153,7 +154,7 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     """Return the protocol, with n_lights and trials taken from its draws file, and the draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
-    draws_file = protocol_module.read_draws(protocol.draws_file)
+    draws_file = read_draws(protocol.draws_file)
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 
@@ -177,7 +178,7 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
         draws_file.check_against(source.light_directions, skipped=skipped)
         return list(draws_file.draws)
     directions, trials = source.light_directions[skipped:], protocol.trials
-    draws = protocol_module.draw_lights(directions, protocol.n_lights, trials=trials, seed=protocol.seed)
+    draws = draw_lights(directions, protocol.n_lights, trials=trials, seed=protocol.seed)
     draws = [tuple(light + skipped for light in draw) for draw in draws]
     # All lights form one draw, but their noise differs from trial to trial.
     return draws * trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
@@ -262,7 +263,7 @@ def evaluate_all(
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
-        for name in set(protocol.skip_first) - {protocol_module.EVERY_CAPTURE, *names}:
+        for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
             raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
     store = TrialStore() if store is None else store
     planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.documents import ComparisonReport
 from splinecli.errors import printable
 from splinecli.evaluation.protocol import Evaluation, heading, lights_value, protocol_in_words
+from splinecli.records.documents import ComparisonReport
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
 SIGNIFICANCE = 0.05  # p-value below which two methods differ

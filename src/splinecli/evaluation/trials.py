@@ -19,16 +19,17 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
 from splinecli.capture.record import StoredCapture, in_one_plane
-from splinecli.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
-from splinecli.diagnosis.odd_images import check_ground_truth
-from splinecli.diagnosis.summary import sample_observations
 from splinecli.errors import InputError
-from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Draw, Protocol
-from splinecli.inference import estimate_normals, find_surface
+from splinecli.estimate.inference import estimate_normals, find_surface
+from splinecli.estimate.methods import Estimator
+from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Protocol
+from splinecli.judge.odd_images import check_ground_truth
+from splinecli.judge.summary import sample_observations
+from splinecli.lights.draws import Draw
 from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.methods import Estimator
+from splinecli.records.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.system.files import as_splinecli_error, refusals_as_output_errors, write_text
 from splinecli.system.progress import Progress, ignore
 from splinecli.system.publishing import is_plain

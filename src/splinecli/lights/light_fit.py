@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.record import Capture
-from splinecli.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECTED, CaptureWarning
 from splinecli.errors import UsageError
-from splinecli.fits.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
 from splinecli.maths import Float32Array, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.robust import absolute_weights, fit_robustly, fit_scaled_normals, lit_values
+from splinecli.records.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECTED, CaptureWarning
 
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 MIN_PIXELS_PER_LIGHT = 10

@@ -23,8 +23,8 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import Blocks, focal_length, ray_basis, rays_at
 from splinecli.surface.integration import integrate_normals
-from splinecli.surface.pixel_grid import Blocks, focal_length, ray_basis, rays_at
 from splinecli.system.machine import side_by_side
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splinecli.fits.robust import fit_robustly, shadow_weights
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.robust import fit_robustly, shadow_weights
 
 SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels

@@ -24,15 +24,14 @@ import torch
 
 from splinecli.capture.record import FoundLights, azimuth_of
 from splinecli.errors import InputError
-from splinecli.fits.robust import fit_robustly, lit_values, shadow_weights
 from splinecli.lights.light_fit import INTENSITY_ERROR, fit_near
+from splinecli.lights.light_net import LightGuess, LightNet, light_net, network_inputs, square_images
 from splinecli.lights.rough_normals import cast_shadows, outward_directions, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
-from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
-from splinecli.networks.weights import light_net
+from splinecli.maths.pixel_grid import Blocks
+from splinecli.maths.robust import fit_robustly, lit_values, shadow_weights
 from splinecli.surface.integration import integrate_normals
-from splinecli.surface.pixel_grid import Blocks
 from splinecli.system.machine import side_by_side
 
 _FITS = 5

@@ -7,11 +7,10 @@ from math import ceil, sqrt
 import numpy as np
 import torch
 
+from splinecli.estimate.methods.batched import context_sample, float_tensors
 from splinecli.lights.lighting import LightingAt
+from splinecli.materials.material_net import Gloss, material_networks
 from splinecli.maths import Bools, Float32Array
-from splinecli.methods.batched import context_sample, float_tensors
-from splinecli.networks.material_net import Gloss
-from splinecli.networks.weights import material_networks
 from splinecli.system.machine import one_thread_each, side_by_side
 
 _MOST_PIXELS = 60_000  # in larger captures, the net is applied to every second, third, ... row and column

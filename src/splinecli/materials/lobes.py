@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.principled import PrincipledMaterial
+from splinecli.materials.principled import PrincipledMaterial
 
 LEAST_Z = 0.05  # of a normal; the BRDF has no value for a surface that faces away from the camera
 F0_OF_SPECULAR = 0.08  # reflectance at normal incidence of a dielectric whose `specular` is 1 (Burley 2012)

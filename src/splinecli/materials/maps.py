@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.estimate.methods.batched import float_tensors
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting, parts_of_pixels
 from splinecli.lights.rough_normals import cast_shadows
 from splinecli.materials.gloss import blurred, estimate_gloss
@@ -24,10 +25,9 @@ from splinecli.materials.lobes import (
     lobe_error,
     predict_left_out,
 )
+from splinecli.materials.material_net import Gloss
 from splinecli.maths import Bools, Float32Array, Floats
-from splinecli.methods.batched import float_tensors
-from splinecli.networks.material_net import Gloss
-from splinecli.output_files import MAPS
+from splinecli.records.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
 _LIT = 0.05  # n.l from which a light is used; the rounded rim of a shadow is below

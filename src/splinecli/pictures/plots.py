@@ -11,16 +11,16 @@ import numpy as np
 
 from splinecli.capture.formats.images import read_image
 from splinecli.errors import printable
+from splinecli.estimate.methods import method_names
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import encode_picture, unit
-from splinecli.methods import method_names
 from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, Picture, bounding_box, colour_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from splinecli.calibration.balls import BallCalibration
+    from splinecli.lights.calibration.balls import BallCalibration
     from splinecli.maths.observation_map import Grid
 
 

@@ -14,13 +14,12 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.capture import capture_name
 from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
-from splinecli.methods import Estimator, MethodOptions, method_names
-from splinecli.output_files import MAPS, NORMALS, REPORT, own_files
+from splinecli.estimate.methods import Estimator, MethodOptions, method_names
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import (
@@ -33,6 +32,7 @@ from splinecli.pipeline.infer import (
     source_bytes,
 )
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
+from splinecli.records.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import NoRoomError, as_splinecli_error, check_writable, find_mode, resolve, write_text

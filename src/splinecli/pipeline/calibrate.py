@@ -3,23 +3,23 @@
 import json
 from typing import Any
 
-from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
-from splinecli.calibration.circle import Circle
-from splinecli.calibration.crosstalk import measure_crosstalk
-from splinecli.calibration.lamps import (
+from splinecli.capture.channel_lights import CROSSTALK
+from splinecli.capture.light_files import read_light_directions, rows_text
+from splinecli.capture.linearise import RadiometricCalibration
+from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
+from splinecli.lights.calibration.circle import Circle
+from splinecli.lights.calibration.crosstalk import measure_crosstalk
+from splinecli.lights.calibration.lamps import (
     Target,
     calibration_report,
     measure_light_intensities,
     summary_lines,
     triangulate_lamps,
 )
-from splinecli.capture.channel_lights import CROSSTALK
-from splinecli.capture.light_files import read_light_directions, rows_text
-from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.output_files import CALIBRATION
 from splinecli.pictures.plots import calibration_picture
 from splinecli.pipeline.options import CalibrateOptions
+from splinecli.records.output_files import CALIBRATION
 from splinecli.system.files import check_free
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, new_files

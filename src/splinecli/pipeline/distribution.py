@@ -21,7 +21,7 @@ from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.system.files import UNFINISHED, made_folder, read_json, refusals_as_output_errors

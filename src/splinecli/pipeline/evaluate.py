@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from splinecli.capture import find_captures, open_capture
-from splinecli.documents import RelightingReport
 from splinecli.errors import InputError, ModelError, UsageError
+from splinecli.estimate.methods import Estimator, MethodOptions, make_estimator
 from splinecli.evaluation.document import TRIALS, write_results
 from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems, relight_first_draw
 from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
 from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
-from splinecli.methods import Estimator, MethodOptions, make_estimator
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.infer import source_bytes
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.pipeline.options import EvaluateOptions
+from splinecli.records.documents import RelightingReport
 from splinecli.system.files import check_writable
 from splinecli.system.machine import count_available_cores
 from splinecli.system.progress import SILENT, Advance, Observer

@@ -8,9 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from splinecli.methods.estimator import student_sizes
-from splinecli.output_files import OutputMap
-from splinecli.restoration.alignment import MOST_VALUES
+from splinecli.estimate.methods.estimator import student_sizes
+from splinecli.images.alignment import MOST_VALUES
+from splinecli.records.output_files import OutputMap
 from splinecli.system.machine import count_available_cores
 
 AUTOMATIC_FROM = 100_000

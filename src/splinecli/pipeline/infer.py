@@ -21,31 +21,32 @@ from splinecli.capture.files import digest
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
-from splinecli.capture_warnings import (
+from splinecli.errors import OutputError, SplinecliError, UsageError
+from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
+from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
+from splinecli.estimate.methods.estimator import FEWEST_PIXELS, student_sizes
+from splinecli.judge.checks import check_capture, check_confidence, refuse_if_strict
+from splinecli.lights.draws import draw_lights
+from splinecli.lights.light_fit import refine_capture
+from splinecli.pictures.maps import encode_png
+from splinecli.pictures.plots import sky_plot
+from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.integrate import view_of_report
+from splinecli.records.capture_warnings import (
     EIGHT_BIT,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
     UNTRAINED_LIGHTS,
     CaptureWarning,
 )
-from splinecli.diagnosis.checks import check_capture, check_confidence, refuse_if_strict
-from splinecli.errors import OutputError, SplinecliError, UsageError
-from splinecli.evaluation.protocol import draw_lights
-from splinecli.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
-from splinecli.lights.light_fit import refine_capture
-from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
-from splinecli.methods.estimator import FEWEST_PIXELS, student_sizes
-from splinecli.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
-from splinecli.pictures.maps import encode_png
-from splinecli.pictures.plots import sky_plot
-from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
-from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.integrate import make_surface, view_of_report
+from splinecli.records.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
 from splinecli.results import files
 from splinecli.results.files import report_of
 from splinecli.results.maps import chosen_maps, make_map, map_files, map_picture
 from splinecli.results.material import base_colour_picture, gloss_picture, material_facts, material_warnings
 from splinecli.results.pages import result_page
+from splinecli.surface.make import make_surface
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
@@ -53,7 +54,7 @@ from splinecli.system.progress import SILENT, Clock, Observer
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 if TYPE_CHECKING:
-    from splinecli.methods.distilled import DistilledEstimator
+    from splinecli.estimate.methods.distilled import DistilledEstimator
 
 
 BASE_BYTES = 500 * 2**20  # for Python, PyTorch and a batch of pixels; captures and their refinement need more
@@ -114,7 +115,7 @@ def distil_for(
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
     teacher = estimator.bind(lighting_at, capture.mask)
-    from splinecli.methods.distilled import distil
+    from splinecli.estimate.methods.distilled import distil
 
     for size in sizes:
         try:

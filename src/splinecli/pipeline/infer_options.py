@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from msgspec import Meta
 
-from splinecli import records
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
@@ -23,14 +22,16 @@ from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import ESTIMATE, MIN_LIGHTS, SIDES_DEG, LightFinder, azimuth_of, check_light_indices
+from splinecli.capture.record import ESTIMATE, SIDES_DEG, LightFinder, azimuth_of, check_light_indices
 from splinecli.errors import UsageError
+from splinecli.estimate.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
+from splinecli.images.alignment import MIN_IMAGES
 from splinecli.maths.normals import Convention
+from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
-from splinecli.output_files import MAPS, NORMALS
-from splinecli.records import FileName, NotNegative, Option, Positive, Record, Seed
-from splinecli.restoration.alignment import MIN_IMAGES
+from splinecli.records import base as records
+from splinecli.records.base import FileName, NotNegative, Option, Positive, Record, Seed
+from splinecli.records.output_files import MAPS, NORMALS
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
 from splinecli.system.files import check_file

@@ -7,22 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.calibration.balls import find_view
 from splinecli.capture.channel_lights import CHANNELS
 from splinecli.capture.formats.images import common_size
 from splinecli.capture.light_files import check_writable, encode_lights
 from splinecli.capture.record import FoundLights
-from splinecli.capture_warnings import estimated_lights
-from splinecli.diagnosis.capture_sample import CaptureSample
-from splinecli.diagnosis.checks import check_sample
-from splinecli.diagnosis.light_check import candidate_rows
-from splinecli.diagnosis.summary import CaptureSummary, summarise_capture
 from splinecli.errors import InputError, UsageError
+from splinecli.judge.capture_sample import CaptureSample
+from splinecli.judge.checks import check_sample
+from splinecli.judge.light_check import candidate_rows
+from splinecli.judge.summary import CaptureSummary, summarise_capture
+from splinecli.lights.calibration.balls import find_view
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import BASE_BYTES, align, infer_bytes
 from splinecli.pipeline.infer_options import InfoOptions, Reading
+from splinecli.records.capture_warnings import estimated_lights
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 

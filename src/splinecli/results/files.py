@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import convert
 
-from splinecli import __version__, output_files
+from splinecli._version import __version__
 from splinecli.capture import Capture
 from splinecli.capture.light_files import rows_text
 from splinecli.capture.record import name_reading
-from splinecli.documents import (
+from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
+from splinecli.pictures.maps import encode_png
+from splinecli.pictures.plots import error_map_picture
+from splinecli.records import output_files
+from splinecli.records.documents import (
     AlignmentReport,
     Distillation,
     EstimateReport,
@@ -25,17 +29,14 @@ from splinecli.documents import (
     UsedWeights,
     WarningReport,
 )
-from splinecli.maths.normals import AngularErrors, Convention, describe, encode_picture
-from splinecli.output_files import REPORT
-from splinecli.pictures.maps import encode_png
-from splinecli.pictures.plots import error_map_picture
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_exr, file_names
+from splinecli.records.output_files import REPORT, SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.surface.surface_files import encode_exr
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
 if TYPE_CHECKING:
-    from splinecli.inference import NormalEstimate
-    from splinecli.methods import Estimator
+    from splinecli.estimate.inference import NormalEstimate
+    from splinecli.estimate.methods import Estimator
     from splinecli.system.progress import Clock
 
 

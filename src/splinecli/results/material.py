@@ -10,19 +10,47 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
-from splinecli.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
-from splinecli.documents import MaterialFacts
-from splinecli.inference import lighting_on
+from splinecli.estimate.inference import lighting_on
 from splinecli.maths import Bools, Float32Array
 from splinecli.maths.transfer import encode_srgb
 from splinecli.pictures.maps import Picture
-from splinecli.results.maps import Progress, colours_of_surface
+from splinecli.records.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
+from splinecli.records.documents import MaterialFacts
+from splinecli.results.map_values import Progress, colours_of_surface, makes
 
 if TYPE_CHECKING:
-    from splinecli.inference import NormalEstimate
+    from splinecli.estimate.inference import NormalEstimate
     from splinecli.materials.maps import MaterialMaps
 
 
+def share_picture(values: Float32Array, _: Bools) -> Picture:
+    """Return values (H, W, 1) as a gray picture (H, W): 0 is black, 1 and more is white."""
+    return np.asarray(np.rint(255 * values[..., 0].clip(0, 1)), np.uint8)
+
+
+def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
+    """Return a linear base colour (H, W, 3) as an sRGB picture."""
+    return encode_srgb(base_colour)
+
+
+def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
+    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue, linear.
+
+    Red is for occlusion in glTF; it is white in the mask.
+    """
+    return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
+
+
+@makes(
+    "material",
+    share_picture,
+    base_colour=base_colour_picture,
+    roughness=share_picture,
+    metalness=share_picture,
+    specular=share_picture,
+    material_confidence=share_picture,
+    metallic_roughness=gloss_picture,
+)
 def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
     """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero outside the mask.
 
@@ -81,24 +109,6 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
         )
         warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
     return warnings
-
-
-def share_picture(values: Float32Array, _: Bools) -> Picture:
-    """Return values (H, W, 1) as a gray picture (H, W): 0 is black, 1 and more is white."""
-    return np.asarray(np.rint(255 * values[..., 0].clip(0, 1)), np.uint8)
-
-
-def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
-    """Return a linear base colour (H, W, 3) as an sRGB picture."""
-    return encode_srgb(base_colour)
-
-
-def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
-    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue, linear.
-
-    Red is for occlusion in glTF; it is white in the mask.
-    """
-    return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
 
 
 PAGE_CAPTIONS = {

@@ -12,13 +12,13 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
-from splinecli.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, Picture, colour_errors, encode_png
+from splinecli.records.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
 from splinecli.results.material import PAGE_CAPTIONS, page_pictures

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
-from splinecli.surface.pixel_grid import focal_length, pixel_rays, ray_basis
+from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper

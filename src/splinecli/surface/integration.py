@@ -18,8 +18,8 @@ import numpy as np
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import Blocks, focal_length
 from splinecli.surface.bilateral_equations import DISCONTINUITY, SMALLEST_COSINE, BilateralEquations, LaplacianSolver
-from splinecli.surface.pixel_grid import Blocks, focal_length
 
 _LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
 _STILL = 0.002  # pixels: the rms movement at which the surface is finished

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
-from splinecli.surface.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
+from splinecli.maths.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
 from splinecli.system.machine import import_extra
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
 from splinecli.maths.transfer import decode_transfer, encode_srgb
+from splinecli.records.output_files import SURFACE_FILES
 from splinecli.system.machine import import_extra
 
 if TYPE_CHECKING:
@@ -24,20 +25,6 @@ if TYPE_CHECKING:
     from splinecli.system.publishing import Content
 
 
-SURFACE_FILES = {
-    "glb": ("mesh.glb",),
-    "ply": ("mesh.ply",),
-    "obj": ("mesh.obj", "mesh.mtl", "mesh.png", "mesh_roughness.png", "mesh_metalness.png"),
-    "stl": ("mesh.stl",),
-    "npy": ("depth.npy",),
-    "tiff": ("depth.tiff",),
-    "png": ("depth.png",),
-    "exr": ("depth.exr",),
-}
-"""The file names of each format; the pictures are the textures of an OBJ file, if there are colours and a gloss."""
-
-LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = "level_normals.npy", "level_normals.png"  # of `integrate --level`
-SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 DEFAULT_FORMATS = ("glb", "ply", "npy", "tiff", "png")
 USUAL_SPECULAR = 0.5  # of glTF: a reflectance of 4 %
 GRAY = 204  # colour of a mesh without a texture, of 255
@@ -52,11 +39,6 @@ class Surface:
     unit: str  # the name of the unit of both
     millimetres: float  # the length of this unit in a file of glTF
     level_normals: NDArray[np.float32] | None = None  # (H, W, 3), the normals of a surface that was levelled
-
-
-def file_names(formats: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of all files that encode_surface may yield."""
-    return tuple(name for form in formats for name in SURFACE_FILES[form])
 
 
 def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, Content]]:

@@ -16,11 +16,11 @@ from PIL.TiffImagePlugin import IFDRational
 
 from capture.conftest import WriteImage
 from scenes import ring_lights, with_chunk, write_capture
-from splinecli import capture_warnings
 from splinecli.capture import open_capture, read_capture, read_image, read_mask
 from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_header
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
+from splinecli.records import capture_warnings
 
 RNG = np.random.default_rng(2)
 RGB16 = RNG.integers(0, 65536, (7, 9, 3)).astype(np.uint16)

@@ -15,14 +15,14 @@ import pytest
 from scipy.io import savemat
 
 from scenes import png_chunk
-from splinecli.calibration.balls import calibrate_ball, find_ball_files
-from splinecli.calibration.lamps import measure_light_intensities
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import check_stored_size, decode_image
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.light_files import read_light_directions
 from splinecli.errors import InputError
+from splinecli.lights.calibration.balls import calibrate_ball, find_ball_files
+from splinecli.lights.calibration.lamps import measure_light_intensities
 from splinecli.pipeline.infer_options import InfoOptions
 from splinecli.pipeline.info import describe_capture
 

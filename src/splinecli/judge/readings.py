@@ -1,0 +1,271 @@
+"""Other readings of the images: encoded values, near lamps, unequal intensities, and light that every image has.
+
+Any one of them can be mistaken for another, so all are fitted to the same pixels and compared together. A matte model
+is fitted under each reading, and its residual is computed in stored values. The probability of a reading is
+
+    p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
+
+where the cost c penalises a reading for its additional freedom and for being rare, and k is the weight of the
+residuals, since no real material is matte. Both were fitted to captures of all classes of materials with and without
+these faults (benchmarks/capture_faults.py --fit).
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from splinecli.capture.near_lamps import NearLamps
+from splinecli.capture.sample import Sample
+from splinecli.maths import Float64Array
+from splinecli.maths.normals import angle_between_deg, spread_of, unit
+from splinecli.maths.robust import absolute_weights, fit_scaled_normals, lit_values, shade
+
+Kind = Literal["curve", "near", "offset", "intensities"]
+ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
+_EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
+SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
+_WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
+COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
+POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
+LIKELY = 0.5  # probability from which a reading is named
+_LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
+_SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A reading of the images, and how well it fits."""
+
+    kind: Kind
+    amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
+    ratio: float  # residual over the given reading's, on the same observations
+    evidence: float  # logarithm of its probability over the given reading's
+    normals: Float64Array  # (p, 3), scaled, at the chosen pixels
+    intensities: Float64Array  # (F,), mean 1; ones unless they are free
+
+
+class Doubt(NamedTuple):
+    """How likely the given reading is wrong, and the reading that is right then."""
+
+    reading: Reading
+    probability: float  # that any other reading is right
+    others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    residual: float
+    normals: Float64Array
+    intensities: Float64Array
+
+
+class Readings:
+    """The pixels of a sample, whose observations are as stored, and the readings that were fitted to them.
+
+    `lights` are (F, 3), unit; `intensities` (F,) were measured, or are None for equal ones. `eight_bit` is
+    whether the images have 8 bits and do not state that they are linear.
+    """
+
+    def __init__(
+        self, sample: Sample, lights: Float64Array, intensities: Float64Array | None = None, *, eight_bit: bool = False
+    ) -> None:
+        n_lights = len(lights)
+        # Pixels below this share of the brightest hundredth are background.
+        chosen, values = lit_values(sample.observations, 0.1, min(400, 16_000 // n_lights))
+        # If a share of 1e-3 of the values is within 1e-5 of the largest one, they are saturated.
+        clipped = sample.observations[chosen] >= (1 - 1e-5) * sample.observations.max()
+        # Values at full scale look like a curve. Treated as shadows, they are ignored.
+        if clipped.sum() > 1e-3 * clipped.size:
+            values[clipped] = 0
+        values = values.clip(min=0)
+        # Three unknowns, and some more values that can contradict them.
+        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
+        self.values, self.lights, self.intensities = values[enough], lights, intensities
+        self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
+        self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
+        self.shape, self.eight_bit = sample.mask.shape, eight_bit
+        self.are_enough = n_lights >= 4 and len(self.values) >= 60
+
+    def fit(self, kinds: Collection[Kind]) -> list[Reading]:
+        """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
+        if not self.are_enough:
+            return []
+        kinds = [kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]]
+        vectors = self._with(self.lights)
+        given, found = _fit(self.values, vectors), list[Reading]()
+        if "offset" in kinds:
+            found.append(_best("offset", self._offset_fits(vectors), given))
+        if "curve" in kinds:
+            found.append(self._best_curve())
+        if not {"near", "intensities"}.isdisjoint(kinds):
+            free = _fit(self.values, vectors, free=True)
+        if "near" in kinds:
+            found.append(self._best_near(free))
+        if "intensities" in kinds:
+            unequal = _best("intensities", {1.0: free}, given, _cost_of_equal(free.intensities))
+            found.append(unequal)
+            if "curve" in kinds:  # unequal lamps may hide a curve
+                curve = self._best_curve(free=True)
+                # The intensities under the curve matter, not the intensities that a linear reading needs.
+                of_lamps = unequal.evidence + _cost_of_equal(free.intensities) - _cost_of_equal(curve.intensities)
+                evidence = curve.evidence + of_lamps
+                found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
+        return found
+
+    def likeliest(self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()) -> Doubt | None:
+        """Return the reading of these kinds that fits best, and how likely it is; None if they cannot be compared.
+
+        Kinds that are `accepted` are part of the given reading.
+        """
+        found = self.fit(kinds)
+        if not found:
+            return None
+        evidence = np.array([reading.evidence for reading in found])
+        probabilities = np.exp(evidence - np.logaddexp.reduce([0.0, *evidence]))
+        shares = dict.fromkeys((reading.kind for reading in found if reading.kind not in accepted), 0.0)
+        for reading, probability in zip(found, probabilities, strict=True):
+            if reading.kind in shares:
+                shares[reading.kind] += float(probability)
+        ranked = sorted(shares, key=lambda kind: -shares[kind])
+        if not ranked:
+            return None
+        best = max((reading for reading in found if reading.kind == ranked[0]), key=lambda reading: reading.evidence)
+        # Readings that are this likely, compared with the likeliest one, are named beside it.
+        others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
+        return Doubt(best, sum(shares.values()), tuple(others))
+
+    def error_deg(self, reading: Reading, used: Float64Array | None = None) -> float:
+        """Return the median angle in degrees between a reading's normals and the given reading's.
+
+        `used` are the intensities (F,) that were estimated and are divided out; None for none.
+        """
+        lights = self.lights if used is None else self.lights * used[:, None]
+        given = _fit(self.values, self._with(lights))
+        return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
+
+    def _best_curve(self, *, free: bool = False) -> Reading:
+        vectors, shadow = self._with(self.lights), 0.35  # encoded shadows are brighter
+        given = _fit(self.values, vectors, free=free, shadow=shadow)
+        fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in _EXPONENTS}
+        return _best("curve", fits, given, -0.8 if self.eight_bit else 0.0)
+
+    def _best_near(self, given: _Fit) -> Reading:
+        """Return the best distance. Intensities are free: near lamps look unequal, and unequal lamps may be near."""
+        fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in _WIDTHS}
+        best = _best("near", fits, given)
+        places = np.stack((self.columns, -self.rows), axis=1)
+        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a cubic function
+        # of the slopes of its normals predicts this share of the variance of the places; near lamps then cost more.
+        across = unit(best.normals)[:, :2]
+        cubic = across * (across**2).sum(axis=1, keepdims=True)
+        terms = np.concatenate((across, cubic, np.ones((len(across), 1))), axis=1)
+        missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
+        roundness = float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
+        cost = 1.9 if roundness > 0.85 else 0.0
+        # At an end of the distances, the residual may fall beyond.
+        cost += 1.3 if best.amount in (_WIDTHS[0], _WIDTHS[-1]) else 0.0
+        return replace(best, evidence=best.evidence - cost)
+
+    def _offset_fits(self, vectors: Float64Array) -> dict[float, _Fit]:
+        """Return fits with constant light, over the value of a pixel that faces the light, and around the best one."""
+        offsets = (0.02 * 1.5**k for k in range(16))
+        fits = {offset: _fit(self.values, vectors, offset=offset) for offset in offsets}
+        for _ in range(3):  # halve the interval around the best constant light
+            tried = sorted(fits)
+            best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
+            for one, other in pairwise(tried[max(best - 1, 0) : best + 2]):
+                between = float(np.sqrt(one * other))
+                fits[between] = _fit(self.values, vectors, offset=between)
+        return fits
+
+    def _near(self, widths: float) -> Float64Array:
+        lamps = NearLamps.of(self.lights * widths * self.width, 1.0, self.shape, equal=True)
+        directions, attenuations = lamps.light_at(lamps.plane_points(self.rows, self.columns))
+        return np.asarray(directions * attenuations[..., None], np.float64)
+
+    def _with(self, lights: Float64Array) -> Float64Array:
+        return lights if self.intensities is None else lights * self.intensities[:, None]
+
+
+def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
+    """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
+
+    The pixels of a flat object repeat each other, so that a reading may fit them by chance.
+    """
+    amount = min(fits, key=lambda each: fits[each].residual)
+    found = fits[amount]
+    least = 1e-4  # 16 bits do not go below it
+    ratio = (found.residual + least) / (given.residual + least)
+    power = POWERS[kind]
+    if len(given.intensities) < _LEAST_LIGHTS["curve"]:
+        power *= 0.6  # four or five lights
+    # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
+    if kind != "intensities" or given.residual < 0.06:
+        spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
+        # Spread of the normals (their second largest standard deviation) from which powers have full weight, and the
+        # share of the weight for a plate.
+        power *= float(np.clip(spread / 0.3, 0.45, 1))
+    evidence = -COSTS[kind] - cost - power * np.log(ratio)
+    return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
+
+
+def _cost_of_equal(intensities: Float64Array) -> float:
+    # Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by
+    # the standard deviation of their logarithms.
+    return float(10.0 * np.exp(-((np.std(np.log(intensities)) / 0.15) ** 2)))
+
+
+def _fit(
+    values: Float64Array,
+    lights: Float64Array,
+    gamma: float = 1.0,
+    *,
+    offset: float = 0.0,
+    free: bool = False,
+    shadow: float = _SHADOW,
+) -> _Fit:
+    """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
+
+    Values (p, F) are scaled to 1; lights are (F, 3) or (p, F, 3), of any length. Intensities e are 1 or free.
+    """
+    lit = (values > shadow).astype(np.float64)
+    observed = values**gamma
+    # The slope of the linear value over the stored one, so that all readings have the same errors.
+    weights = start = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1))
+    intensities = np.ones(values.shape[1])
+    if offset:
+        # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
+        above = np.maximum(observed - offset / (offset + 0.8), 0)
+        normals = fit_scaled_normals(above, start, lights)
+    for _ in range(14 if offset else 30 if free else 8):
+        if offset:
+            facing = (shade(normals, lights) > 0)[..., None]
+            # Newton's step on |b|, halved: with much constant light, whole steps miss.
+            next_normals = fit_scaled_normals(observed, weights, facing * lights + offset * unit(normals)[:, None])
+            normals = (normals + next_normals) / 2
+            predicted = np.maximum(shade(normals, lights), 0) + offset * np.linalg.norm(normals, axis=1, keepdims=True)
+        else:
+            normals = fit_scaled_normals(observed, weights, lights * intensities[:, None])
+            predicted = shade(normals, lights) * intensities
+        weights = start * absolute_weights(observed - predicted)
+        if free:
+            intensities = _intensities(observed, predicted / intensities, weights, intensities)
+    residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
+    # The fits to few lights pass through most values. The median would be zero.
+    typical = np.median(residuals) if values.shape[1] >= 8 else residuals.mean()
+    return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
+
+
+def _intensities(
+    observed: Float64Array, equal: Float64Array, weights: Float64Array, before: Float64Array
+) -> Float64Array:
+    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity 1."""
+    weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
+    power = (weights * equal**2).sum(axis=0)
+    found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
+    found = np.clip(found / found.mean(), 0.05, 20)
+    intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
+    return np.asarray(intensities / intensities.mean())

@@ -1,0 +1,1 @@
+"""The ordered steps from stored pixels to trusted observations."""

@@ -1,0 +1,288 @@
+"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
+from msgspec.json import schema_components
+
+from splinecli.maths.normals import AngularErrors
+from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.records.base import Count, Natural, NotNegative, Positive, Share
+from splinecli.records.capture_warnings import WARNINGS
+from splinecli.records.white_level import WhiteLevel
+from splinecli.system.progress import STAGES
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]  # of a camera, in pixels
+Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+Camera = Literal["orthographic", "perspective"]
+Unit = Literal["pixel", "mean depth", "millimetre"]
+Code = Annotated[str, Meta(extra_json_schema={"enum": sorted(WARNINGS)})]
+LightCount = Annotated[int, Meta(ge=MIN_LIGHTS)]
+DrawnLights = LightCount | Literal["all"]
+ImageSize = tuple[Count, Count]  # width and height
+
+
+class Document(Struct, kw_only=True, forbid_unknown_fields=True):
+    """A part of a document."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        values: dict[str, Any] = to_builtins(self, enc_hook=lambda number: number.item())  # of NumPy
+        return values
+
+
+class UsedWeights(Document):
+    """A weight file."""
+
+    name: str
+    sha256: Digest
+
+
+class NearLampsReport(Document):
+    """Near lamps: distances from the middle of the object, all lengths in one unit."""
+
+    distances: list[Positive]
+    pixel_size: Positive
+    camera: Camera
+    camera_matrix: Matrix | None
+    lobes: list[tuple[float, float, float, float]] | None
+
+
+class MeanAndTail(Document):
+    """Mean and 95th percentile, in degrees."""
+
+    mean: float
+    p95: float
+
+
+class Distillation(Document):
+    """How a capture was distilled. Numbers of pixels, and degrees."""
+
+    sample: Natural
+    held_out: Natural
+    angle_to_network_deg: MeanAndTail
+    expected_error_deg: float
+    unlike_pixels: Natural
+
+
+class WarningReport(Document):
+    """A warning."""
+
+    code: Code
+    text: str
+
+
+class SurfaceFacts(Document):
+    """Depth map and mesh."""
+
+    camera: Camera
+    unit: Unit
+    pixel_size_mm: Positive | None
+    range: tuple[float, float]
+    n_vertices: Natural
+    n_triangles: Natural
+    normal_texture: bool
+    discontinuity: NotNegative
+
+
+class AlignmentReport(Document):
+    """How images that moved were aligned: transforms from pixels (x, y, 1) of the reference, and motions in pixels."""
+
+    reference: str
+    model: Literal["translation", "similarity", "homography"]
+    transforms: list[Matrix]
+    moved_pixels: list[NotNegative]
+
+
+class MaterialFacts(Document):
+    """The material: whether the images have no colour, and the confidence."""
+
+    gray: bool
+    mean_confidence: Share
+    determined: Share  # the share of the pixels whose confidence is at least 0.5
+    median_roughness: Share
+
+
+class EstimateReport(Document):
+    """The part of a report of infer that describes the estimate."""
+
+    schema: Literal[3]  # incremented when the meaning of a field changes
+    capture: str
+    method: str
+    weights: UsedWeights | None
+    n_lights: LightCount
+    light_indices: list[Natural]
+    light_file: str | None
+    light_directions: list[Vector]
+    light_errors_deg: list[NotNegative] | None
+    near_lamps: NearLampsReport | None
+    camera_matrix: Matrix | None
+    estimated_intensities: list[Any] | None
+    n_pixels: Count
+    image_size: ImageSize
+    device: str
+    precision: str
+    distillation: Distillation | None
+    peak_memory_mib: Natural | None
+    warnings: list[WarningReport]
+    angular_error_deg: AngularErrors | None
+    expected_under_5: Share | None
+    capture_judged: bool | None
+    options: dict[str, Any]
+    inputs_sha256: Digest
+    version: str
+    reading: Annotated[str, Meta(pattern="^(restored|as stored)$")]
+    white_level: WhiteLevel | None
+    # standard deviation in pixels of the blur that was removed from the images
+    removed_blur: float | None
+    alignment: AlignmentReport | None
+    material: MaterialFacts | None
+    surface: SurfaceFacts | None
+
+
+class Report(EstimateReport):
+    """report.json of infer, and an item of the list of infer --json."""
+
+    seconds: Annotated[dict[str, NotNegative], Meta(extra_json_schema={"required": [*STAGES, "total"]})]
+    folder: str
+    files: list[str]
+    file_sizes: dict[str, Natural]
+
+
+class LevelReport(Document):
+    """The slope that was removed: its direction in x and y, and its angle."""
+
+    slopes: tuple[float, float]
+    tilt_deg: NotNegative
+
+
+class SurfaceReport(SurfaceFacts):
+    """surface.json, and the document of integrate --json."""
+
+    schema: Literal[3]
+    normals: str
+    colours: str | None
+    prior: str | None
+    level: LevelReport | None
+    pixel_aspect: Positive
+    n_pixels: Natural
+    image_size: ImageSize
+    seconds: NotNegative
+    folder: str
+    files: list[str]
+
+
+class ProtocolReport(Document):
+    """How an evaluation was done. With several evaluations, the settings that differ are lists."""
+
+    n_lights: DrawnLights | list[DrawnLights]
+    trials: Count
+    seed: int
+    draws: str | None
+    light_noise_deg: NotNegative | list[NotNegative]
+    max_pixels: int | None
+    skip_first: dict[str, int]
+    as_stored: bool
+    white_level: float | None
+    light_error_deg: float | None
+    lights_estimated: bool
+
+
+class MethodResult(Document):
+    """The result of a method on a capture, in degrees and seconds."""
+
+    method: str
+    capture: str
+    n_lights: LightCount
+    light_noise_deg: NotNegative
+    mae_deg: NotNegative
+    std_deg: NotNegative
+    trials: Count
+    seconds: NotNegative
+    as_stored: bool
+    found_light_error_deg: NotNegative | None
+    maes_deg: Annotated[list[NotNegative], Meta(min_length=1)]
+
+
+class ComparisonReport(Document):
+    """Two methods compared trial by trial, on a capture or on the average over the captures, in degrees."""
+
+    # With one trial, or if the differences of all trials are equal but not zero, no test is possible, and the last four
+    # are None. If all differences are zero, the interval is (0, 0) and p is 1.
+    first: str
+    second: str
+    capture: str
+    n_lights: DrawnLights
+    light_noise_deg: NotNegative
+    trials: int
+    difference_deg: float  # mean over the trials of the errors of `first` minus those of `second`
+    std_deg: NotNegative  # population standard deviation of the differences
+    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
+    interval_deg: tuple[float, float] | None
+    p_value: float | None
+    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
+    differs: bool | None
+
+
+class SkippedCapture(Document):
+    """A capture that could not be scored."""
+
+    capture: str
+    reason: str
+
+
+class Likeness(Document):
+    """How well pictures agree with photographs, over all pixels of the mask and all held-out lights."""
+
+    psnr_db: float  # peak signal-to-noise ratio, relative to white
+    error: NotNegative  # mean absolute difference, relative to the mean of the photographs
+
+
+class RelightingReport(Document):
+    """The likeness of pictures of a capture to photographs under the lights that a draw leaves out."""
+
+    capture: str
+    method: str
+    lights: list[Natural]
+    held_out: Count
+    material: Likeness
+    lambertian: Likeness
+    nearest: Likeness
+
+
+class Results(Document):
+    """results.json, and the document of evaluate --json."""
+
+    schema: Literal[1]
+    protocol: ProtocolReport
+    methods: dict[str, dict[str, Any]]
+    results: list[MethodResult]
+    averages: dict[str, NotNegative | dict[str, NotNegative]]
+    comparisons: list[ComparisonReport]
+    skipped: list[SkippedCapture]
+    notes: list[str]
+    version: str
+    relighting: list[RelightingReport] | UnsetType = UNSET
+
+
+class Failure(Document):
+    """Printed instead of a report after an error; only infer includes the name of the capture."""
+
+    error: str
+    exit_code: Count
+    capture: str | UnsetType | None = UNSET
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of all documents, docs/reports.schema.json."""
+    references, parts = schema_components((Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}")
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Documents of splinecli: report.json, surface.json, results.json, and the document that replaces them"
+        " after a failure",
+        "anyOf": list(references),
+        "$defs": parts,
+    }

@@ -1,0 +1,16 @@
+"""The white level of a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Origin = Literal["given", "file", "images", "full scale"]
+
+
+@dataclass(frozen=True)
+class WhiteLevel:
+    """The stored value from which observations are considered saturated."""
+
+    value: float  # in the unit of the files, such as 4095
+    origin: Origin  # given by the user, stated in the file, seen in the images, or the full scale of the files

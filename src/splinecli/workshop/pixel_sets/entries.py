@@ -1,0 +1,236 @@
+"""Creation of pixel-set entries from captures with ground truth and from rendered scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splinecli.capture import capture_name, open_capture
+from splinecli.capture.files import digest
+from splinecli.capture.record import name_reading
+from splinecli.errors import InputError, OutputError
+from splinecli.system.files import file_sha256, free_name, replacing
+from splinecli.system.machine import import_extra
+from splinecli.workshop.pixel_sets.store import ARRAYS, Pixels, PixelSetWriter
+from splinecli.workshop.synthesis.meshes import read_mesh
+from splinecli.workshop.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.shapes import draw_view, read_relief
+
+
+class CaptureChangedError(OutputError):
+    """A capture has changed since its entry was created."""
+
+
+def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
+    """Choose an entry name for each capture, and return the folders by name.
+
+    A capture already in the set keeps its name. A new capture is named after its folder, with a number if another
+    capture has that name. Duplicate folders are used only once, because the same pixels must not be used for both
+    training and validation.
+    """
+    captures: dict[str, Path] = {}
+    for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
+
+        def is_taken(name: str, source: str = str(resolved)) -> bool:
+            by_another = name in writer and writer.recipe_of(name).get("source") != source
+            return name in captures or by_another
+
+        captures[free_name(capture_name(folder), is_taken)] = folder
+    return captures
+
+
+def add_capture(
+    writer: PixelSetWriter,
+    name: str,
+    folder: Path,
+    *,
+    as_stored: bool = False,
+    white_level: float | None = None,
+    update: bool = False,
+) -> None:
+    """Read a capture and write its pixels with ground truth, unless the set has them.
+
+    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains on them at half
+    resolution. By default, saturated observations, from `white_level` if it is given, are restored and unknown light
+    intensities are estimated, as `infer` does; `as_stored` leaves the values unchanged. `update` replaces an entry
+    whose capture changed.
+
+    Raises InputError if the capture cannot be read, or has no ground truth; CaptureChangedError if it changed since its
+    entry was created, and `update` is not set; OutputError if the entry cannot be written.
+    """
+    source = open_capture(folder, white_level=white_level)
+    recipe: dict[str, Any] = {
+        "source": str(folder.resolve()),
+        "reading": name_reading(as_stored=as_stored),
+        "white_level": white_level,
+        # The stamp depends on the white level too, so it is compared last.
+        "files": digest(source.stamp),
+    }
+    if source.lamps is not None and source.lamps.used:
+        raise InputError(
+            "the capture has near lamps, and training needs distant lights",
+            path=folder,
+            hint="Leave it out, or render or photograph it under distant lights",
+        )
+    if name in writer:
+        difference = writer.difference(name, recipe)
+        if difference is None:
+            return
+        if not update:
+            problem = f"its entry {name} was made with {difference}"
+            if difference.startswith("files ="):
+                problem = f"its files changed since the entry {name} was made"
+            hint = "Add --update to read it again, or choose another -o"
+            raise CaptureChangedError(problem, path=folder, hint=hint)
+    if source.files.ground_truth is None:
+        raise InputError("the capture has no ground truth, which training needs", path=folder)
+    capture = source.read(as_stored=as_stored)
+    assert capture.ground_truth is not None
+    normals = capture.ground_truth[capture.mask]
+    # The PRPS images of CyclesPS are used at half resolution.
+    step = 2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
+    rows, columns = np.nonzero(capture.mask)
+    used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
+    if not used.any():
+        raise InputError("no pixel of the mask has a ground-truth normal", path=folder)
+    mask = np.zeros_like(capture.mask)
+    mask[capture.mask] = used
+    directions = capture.light_directions.astype(np.float32)
+    pixels = Pixels(capture.observations[used], normals[used].astype(np.float32), directions, mask[::step, ::step])
+    # All materials of a CyclesPS object have the same shape.
+    scene = source.files.folder.absolute().name if source.files.boundaries else name
+    writer.add(name, scene, str(folder), recipe, pixels)
+
+
+RENDERER = 5  # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlan:
+    """The scenes to render: first the views of each mesh file, then `count` random scenes."""
+
+    config: SceneConfig
+    seed: int
+    count: int
+    meshes: tuple[Path, ...] = ()
+    views: int = 0  # random views per mesh, see draw_view; 0 for one view along its +z axis
+    reliefs: tuple[Path, ...] = ()  # normal maps, for half of the scenes
+
+    @cached_property
+    def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
+        """The mesh, name and number of each mesh scene; the number does not depend on the count of views.
+
+        The name is the file name, with a number if another mesh has the same name.
+        """
+        taken: list[str] = []
+        for path in self.meshes:
+            taken.append(free_name(path.stem, taken.__contains__))
+        named = [*zip(self.meshes, taken, range(len(taken)), strict=True)]
+        if not self.views:
+            return tuple(named)
+        views = range(self.views)
+        return tuple((path, f"{name}-view{n:03}", mesh + 10_000 * n) for n in views for path, name, mesh in named)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of the scenes."""
+        return (*(name for _, name, _ in self._of_mesh), *(f"scene{index:04}" for index in range(self.count)))
+
+    def entry_names(self, position: int) -> dict[str, str]:
+        """Return the names of a scene's entries by material."""
+        return {kind: f"{self.names[position]}-{kind}" for kind in MATERIALS}
+
+    def recipe(self, position: int) -> dict[str, Any]:
+        """Return the values that determine the content of a scene."""
+        meshes = self._of_mesh[position : position + 1]
+        shapes = [file_sha256(path) for path, _, _ in meshes]
+        if meshes and self.views:  # another mesh may be placed next to it
+            shapes += [file_sha256(path) for path in self.meshes]
+        return {
+            "renderer": RENDERER,
+            **asdict(self.config),
+            "seed": self.seed,
+            "mesh": shapes or None,
+            "views": int(bool(shapes and self.views)),
+            "reliefs": [file_sha256(path) for path in self.reliefs],
+        }
+
+    def check_inputs(self) -> None:
+        """Check the inputs before rendering.
+
+        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the packages of the extra
+        `render` are not installed.
+        """
+        if self.names:
+            for package in ("embreex.rtcore_scene", "skimage.measure"):
+                import_extra(package, "render")
+        for path in self.meshes:
+            read_mesh(path)
+        for path in self.reliefs:
+            read_relief(path)
+
+    def check_set(self, writer: PixelSetWriter) -> None:
+        """Raise OutputError if the set contains one of the scenes rendered with other settings."""
+        for position in range(len(self.names)):
+            recipe = self.recipe(position)
+            for name in self.entry_names(position).values():
+                difference = writer.difference(name, recipe) if name in writer else None
+                if difference is not None:
+                    raise OutputError(
+                        f"the entry {name} was made with {difference}", path=writer.folder, hint="Choose another -o"
+                    )
+
+    def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
+        """Render a scene; return its shape in words, and the pixels by material.
+
+        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or
+        nothing is visible to the camera; UsageError if the packages of the extra `render` are not installed.
+        """
+        mesh_file = mesh = None
+        index = position - len(self._of_mesh)
+        if index < 0:
+            mesh_file, _, number = self._of_mesh[position]
+            index = 1_000_000 + number  # of its own random stream, so that a mesh does not change any other scene
+            mesh = read_mesh(mesh_file)
+            if self.views:
+                others = tuple(path for path in self.meshes if path != mesh_file)
+                mesh = draw_view(mesh, others, np.random.default_rng([self.seed, index, 2]))
+        scene = draw_scene(self.seed, index, self.config, mesh, self.reliefs)
+        rendered = render_scene(scene, self.config, progress)
+        if not rendered.mask.any():
+            raise InputError(
+                "the camera sees nothing of the mesh",
+                path=mesh_file or self.names[position],
+                hint="The camera looks along -z. A face is visible if its corners are counter-clockwise"
+                " as seen from the camera",
+            )
+        normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
+        # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
+        observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
+        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
+
+    def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
+        """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
+        recipe = self.recipe(position)
+        # All views of a mesh have one name, because all are used for training or all for validation.
+        scene = self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
+        for kind, name in self.entry_names(position).items():
+            writer.add(name, scene, f"rendered: {shape}", recipe, pixels[kind])
+
+
+def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
+    """Write the pixels of a scene to a file for load_rendered. Raises OutputError."""
+    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
+    with replacing(path) as file:
+        np.savez(file, **arrays)
+
+
+def load_rendered(path: Path) -> dict[str, Pixels]:
+    """Return the pixels in a file written by save_rendered. Raises OSError."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in MATERIALS}

@@ -1,0 +1,160 @@
+"""Methods by name, and what must not change their answers: order of lights, scale of images, size of batches."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from scenes import spiral_lights
+from splinecli.errors import ModelError, UsageError
+from splinecli.estimate.methods import Estimator, MethodOptions, make_estimator, method_names
+from splinecli.estimate.methods.estimator import LeastSquares
+from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import save_weights
+from splinecli.lights.lighting import PixelLighting
+from splinecli.maths.normals import angle_between_deg
+from tiny_networks import TINY
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
+def save_tiny(path: Path, **settings: Any) -> str:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        save_weights(SplineNet(NetworkConfig(**TINY, **settings)), path)
+    return str(path)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> str:
+    return save_tiny(tmp_path / "tiny.safetensors")
+
+
+def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
+    truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
+    observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
+    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
+    fingerprints = set()
+    for name in method_names():
+        file = alone if name == "cnn-ps" else weights
+        estimator = make_estimator(name, MethodOptions(weights=file, device="cpu", precision="float32"))
+        assert estimator.name == name
+        assert estimator.device == "cpu"
+        fingerprints.add(estimator.fingerprint)
+        # A matte pixel without shadow is easy for all of them; the network starts from the Lambertian fit.
+        normals = estimator.estimate(observations, LIGHTS)
+        assert normals.shape == (3, 3)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+        np.testing.assert_allclose(normals, truth, atol=0.01)
+    assert len(fingerprints) == len(method_names())
+
+
+def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
+    options = MethodOptions(weights=weights, device="cpu", precision="float32")
+    others = (replace(options, rotations=3), replace(options, precision="bfloat16"))
+    fingerprints = {make_estimator("spline-net", o).fingerprint for o in (options, *others)}
+    assert len(fingerprints) == 3
+    same = make_estimator("spline-net", replace(options, batch_size=3))
+    assert same.fingerprint in fingerprints
+
+
+def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
+    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
+    for method, file, message in (
+        ("cnn-ps", weights, "'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net"),
+        ("spline-net", alone, "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            make_estimator(method, MethodOptions(weights=file))
+
+
+@pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
+def test_counts_from_one(options: MethodOptions, weights: str) -> None:
+    with pytest.raises(UsageError, match="whole numbers from 1"):
+        make_estimator("spline-net", replace(options, weights=weights))
+
+
+Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+SEE_CAPTURE = ("spline-net", "spline-net-pixelwise")
+"""Methods that compare the brightness of pixels."""
+
+
+def make(name: str, batch_size: int | None = None) -> Estimator:
+    return make_estimator(name, MethodOptions(device="cpu", precision="float32", batch_size=batch_size))
+
+
+def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    return float(angle_between_deg(a, b).max())
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
+def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> None:
+    """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten rotations go."""
+    _, lights, observations = glossy_pixels
+    order, turn = np.arange(len(lights)), np.eye(3)
+    if change == "order of lights":
+        order = np.random.default_rng(0).permutation(len(lights))
+    elif change == "turn" and name != "cnn-ps":
+        turn = _about_view_axis(0.7)
+    factors = np.full((len(observations), 1), {"darker": 1e-3, "brighter": 1000.0}.get(change, 1.0))
+    if name not in SEE_CAPTURE:
+        # A factor for each pixel: albedo is unknown, so it may not matter either.
+        factors *= np.linspace(0.5, 2, len(observations))[:, None]
+    before = make(name).estimate(observations.astype(np.float32), lights)
+    changed = (observations * factors)[:, order].astype(np.float32)
+    after = make(name, 7 if change == "batches" else None).estimate(changed, lights[order] @ turn)
+    assert largest_difference_deg(before @ turn, after) < 0.05
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("n_lights", [3, 4, 14])
+def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    odd = observations[:6, :n_lights].astype(np.float32)
+    odd[0] = 0
+    odd[1] = 1
+    odd[2, 1:] = 0
+    odd[3] = np.where(np.arange(n_lights) < 2, odd[3] + 1, 0)
+    odd[4] *= -1  # a dark frame may have been subtracted
+    found = make(name).estimate(odd, lights[:n_lights])
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    np.testing.assert_array_equal(found[0], (0, 0, 1))
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) -> None:
+    """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights of their own.
+
+    Both see the same capture, if they see one at all.
+    """
+    _, lights, observations = glossy_pixels
+    some = observations[:6].astype(np.float32)
+    turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
+    method = make(name).bind(lambda rows: PixelLighting(some[rows], turned[rows]), np.ones((1, len(some)), np.bool_))
+    together = method.estimate(some, turned)
+    pairs = [method.estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
+    assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05
+    # The lights matter: without their own, the pixels get other normals.
+    assert largest_difference_deg(together[2:], method.estimate(some, lights)[2:]) > 1
+
+
+def _about_view_axis(angle: float) -> NDArray[np.float64]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("count", [3, 4, 10, 96])
+def test_solves_the_normal_equations(count: int) -> None:
+    observations = np.random.default_rng(0).uniform(size=(50, count))
+    directions = spiral_lights(count)
+    estimate = LeastSquares().estimate(observations, directions)
+    expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
+    np.testing.assert_allclose(estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12)

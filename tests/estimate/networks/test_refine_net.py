@@ -1,0 +1,217 @@
+"""The refinement net: symmetries, the mask, how far it sees; pixels see their own capture, and no others."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from distributions import generator as seeded
+from splinecli.estimate.fits.least_squares import alternating_signs
+from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.refine_net import CHANNELS, COARSEST, RefineNet, channels, split_features, with_refined
+from splinecli.estimate.networks.set_branch import ContextLayer
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.refinement.features import Turn, refine_features, turn_features, turn_maps
+from tiny_networks import TINY, random_network
+
+HEIGHT, WIDTH = 6, 9
+
+
+def random_net(*, twice: bool = False) -> RefineNet:
+    """A net whose every layer does something."""
+    generator = torch.Generator().manual_seed(0)
+    net = RefineNet(twice=twice)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return net.eval()
+
+
+def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    mask = (torch.rand(1, 1, height, width, generator=generator) < 0.9).float()
+    features = torch.randn(1, CHANNELS, height, width, generator=generator) * mask
+    return features, mask
+
+
+def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
+    """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H, W)."""
+    rows = [maps.flatten(1).T.contiguous() for maps in (observations, normals, error)]
+    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7, alternating_signs(lights))
+    return features.T.view(-1, *observations.shape[1:])
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
+    generator = torch.Generator().manual_seed(1)
+    lights = torch.nn.functional.normalize(
+        torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
+    )
+    normals = torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
+    normals = torch.nn.functional.normalize(normals, dim=0)
+    error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
+    shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
+    observations = shading**1.5 + 0.05 * torch.rand(8, HEIGHT, WIDTH, generator=generator)
+
+    def turned(vectors: Tensor) -> Tensor:
+        """Vectors (3, ...), turned."""
+        x, y, z = (-vectors[0] if mirror else vectors[0]), vectors[1], vectors[2]
+        for _ in range(quarters):
+            x, y = -y, x
+        return torch.stack((x, y, z))
+
+    def moved(maps: Tensor) -> Tensor:
+        return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
+
+    expected = features_of(moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error))
+    turn = Turn(quarters, mirror)
+    features = features_of(observations, lights, normals, error)
+    found = turn_features(features, turn)
+    found_normals = turn_maps(normals, turn, vectors=((0, 1),))
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-4)
+    torch.testing.assert_close(found_normals, turned(moved(normals)))
+    torch.testing.assert_close(turn_features(found, turn.back), features)
+    torch.testing.assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_a_new_net_changes_nothing(twice: bool) -> None:
+    features, mask = random_maps(12, 15)
+    features[:, :3] = torch.nn.functional.normalize(features[:, :3], dim=1)
+    normals, error = RefineNet(twice=twice)(features, mask)
+    before, error_before = split_features(features)
+    torch.testing.assert_close(normals, before * mask)
+    torch.testing.assert_close(error, error_before * mask)
+
+
+def test_a_second_net_reads_the_results_of_the_first() -> None:
+    features, mask = random_maps(12, 16)
+    both = random_net(twice=True)
+    assert both.again is not None
+    first = RefineNet()
+    first.load_state_dict({name: value for name, value in both.state_dict().items() if "again" not in name})
+    normals, error = first(features, mask)
+    changed = with_refined(features, normals, error)
+    torch.testing.assert_close(split_features(changed), (normals, error))
+    for fit in ("robust", "plain"):  # the fits themselves stay
+        torch.testing.assert_close(
+            changed[:, channels(fit)] + normals, features[:, channels(fit)] + features[:, channels("normal")]
+        )
+    found = both(features, mask, (slice(0, 8), slice(8, 16)))
+    for part, whole in zip(found, both.again(changed * mask, mask), strict=True):
+        torch.testing.assert_close(part, whole[..., :8, 8:], atol=1e-4, rtol=1e-4)
+    assert (found[0] - normals[..., :8, 8:]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
+    features, mask = random_maps(20, 24)
+    wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
+    wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
+    net = random_net(twice=twice).double()
+    box = (..., slice(2 * COARSEST, 2 * COARSEST + 20), slice(COARSEST, COARSEST + 24))
+    found = net(features.double(), mask.double()), net(wide.double(), wide_mask.double())
+    for alone, within in zip(*found, strict=True):
+        torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("twice", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_nothing_beyond_the_reach_counts(turned: bool, twice: bool) -> None:
+    """Along a strip that is as wide as two of the coarsest cells."""
+    net = random_net(twice=twice).double()
+    size = 2 * net.reach + COARSEST
+    features, mask = random_maps(*((2 * COARSEST, size) if turned else (size, 2 * COARSEST)))
+    before = net(features.double(), mask.double())
+    for place in (0, size - 1):
+        changed = features.clone().double()
+        changed.select(-1 if turned else -2, place).add_(1)
+        after = net(changed, mask.double())
+        far = torch.arange(size).sub(place).abs() >= net.reach
+        for one, other in zip(before, after, strict=True):
+            difference = (one - other).abs().amax(dim=(0, 1, 2 if turned else 3))
+            assert difference[far].max() == 0
+            assert difference.max() > 0
+
+
+SEES = TINY | {"map_size": 16, "set_width": 16, "set_layers": 2, "error_head": True}
+
+
+def pixels(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Random observations under seven lights."""
+    lights = torch.nn.functional.normalize(torch.rand(7, 3, generator=seeded(seed)) + 0.2, dim=1)
+    return torch.rand(count, 7, generator=seeded(seed + 1)), lights
+
+
+@pytest.fixture(scope="module")
+def network() -> SplineNet:
+    return random_network(**SEES, sees_capture=True)
+
+
+def test_at_first_a_capture_says_nothing() -> None:
+    alone, seeing = (SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True))
+    for parameter in alone.parameters():  # the layers that are zero at first, too
+        torch.nn.init.normal_(parameter, std=0.1) if not parameter.any() else None
+    assert not seeing.load_state_dict(alone.state_dict(), strict=False).unexpected_keys
+    assert alone.encode_context(*pixels(3)) is None
+    observations, lights = pixels(12)
+    for found, expected in zip(seeing(observations, lights), alone(observations, lights), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> None:
+    observations, lights = pixels(20)
+    context = network.encode_context(observations, lights)
+    whole = network(observations, lights)
+    parts = [network(part, lights, context=context) for part in observations.split(7)]
+    torch.testing.assert_close(torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0)
+    torch.testing.assert_close(torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0)
+    # It does say something, and the order of the sample does not matter.
+    other = network(observations, lights, context=network.encode_context(*pixels(20, 5)))
+    assert (other.normals - whole.normals).abs().max() > 1e-3
+    shuffled = network.encode_context(observations.flip(0), lights)
+    again = network(observations, lights, context=shuffled)
+    torch.testing.assert_close(again.normals, whole.normals, atol=3e-5, rtol=0)
+
+
+def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
+    captures = [pixels(9, seed) for seed in (0, 10, 20)]
+    # Pixel p belongs to capture p % 3.
+    observations = torch.stack([seen for seen, _ in captures], dim=1).flatten(0, 1)
+    lights = torch.stack([lights.expand(9, 7, 3) for _, lights in captures], dim=1).flatten(0, 1)
+    maps = network.build_maps(observations, lights)
+    together = network.estimate(maps, network.interpolate(maps), captures=3)
+    for number, (seen, own) in enumerate(captures):
+        maps = network.build_maps(seen, own)
+        alone = network.estimate(maps, network.interpolate(maps))
+        # Processors with AMX round sums of other sizes of batches differently; another capture would change 0.01.
+        torch.testing.assert_close(together.normals[number::3], alone.normals, atol=3e-4, rtol=0)
+
+
+def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(network: SplineNet) -> None:
+    observations, lights = pixels(16)
+    whole = network(observations, lights).normals
+    torch.testing.assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
+    darker = observations * torch.linspace(0.1, 1, 16)[:, None]
+    assert (network(darker, lights).normals - whole).abs().max() > 1e-3
+
+
+def test_attention_and_mean_are_those_of_the_formulas() -> None:
+    """One capture, computed once more pixel by pixel and head by head in float64."""
+    torch.manual_seed(0)
+    layer = ContextLayer(16).double()
+    torch.nn.init.normal_(layer.join[2].weight)
+    tokens, level = torch.randn(5, 16).double(), torch.randn(5, 1).double()
+    found, _ = layer(tokens, level, 1, None)
+    embedded = layer.embed(torch.cat((tokens, level), dim=1))
+    sample, queries = layer.key_norm(embedded), layer.query_norm(embedded)
+    keys, values = layer.keys_values(sample).chunk(2, dim=1)
+    for pixel in range(5):
+        heads = []
+        for head in range(4):
+            part = slice(4 * head, 4 * head + 4)
+            asked = layer.queries(queries)[pixel, part]
+            weights = torch.softmax(keys[:, part] @ asked / 2, dim=0)
+            heads.append(weights @ values[:, part])
+        seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
+        torch.testing.assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)

@@ -1,0 +1,156 @@
+"""The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scenes import directions_at, halfway
+from splinecli.capture import Capture
+from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.methods import MethodOptions, make_estimator
+from splinecli.estimate.refinement.refiner import MARGIN, TILE, NetworkRefiner
+from splinecli.lights.lighting import PixelLighting
+from splinecli.maths.normals import angle_between_deg, unit
+
+SIZE = 48
+HALVED = False
+SEAMS = 3 * MARGIN  # the side of a map whose tiles at the corners see a part of it
+AZIMUTH = np.arange(10) * np.radians(36)
+ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
+LIGHTS = directions_at(AZIMUTH, ZENITH)
+ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
+PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
+
+
+def scene(
+    normals: NDArray[np.floating],
+    albedo: NDArray[np.floating] | float,
+    *,
+    noise: float,
+    gloss: float = 0.0,
+    unmeasured: NDArray[np.floating] | float = 1.0,
+) -> Capture:
+    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale.
+
+    The lamps are `unmeasured` times as strong as the capture says.
+    """
+    rng = np.random.default_rng(0)
+    flat = normals.reshape(-1, 3)
+    observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
+    observations = unmeasured * (observations + gloss * (flat @ halfway(LIGHTS).T).clip(0) ** 60)
+    observations += noise * observations.max() * rng.normal(size=observations.shape)
+    mask = np.ones(normals.shape[:2], np.bool_)
+    return Capture(
+        "scene", observations.clip(0).astype(np.float32), LIGHTS, tuple(range(10)), mask, normals.astype(np.float32)
+    )
+
+
+@pytest.fixture(params=[False, True], ids=["as it is", "halved"], autouse=True)
+def halved(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the net sees a scene at half the resolution, as the largest captures, or as it is."""
+    monkeypatch.setattr(request.module, "HALVED", request.param)
+
+
+def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, NormalEstimate]:
+    """Estimate a scene with and without refinement; see `scene`."""
+    capture = scene(*surface, **faults)
+    estimator = make_estimator("spline-net")
+    estimator.refiner.most_pixels = capture.n_pixels - HALVED  # type: ignore[attr-defined]
+    return estimate_normals(capture, estimator), estimate_normals(capture, make_estimator("spline-net-pixelwise"))
+
+
+def mean_error_deg(estimate: NormalEstimate) -> float:
+    return estimate.errors.mean
+
+
+@pytest.mark.parametrize(("noise", "most_tilted_deg"), [(0.01, 0.3), (0.03, 0.75)])
+def test_a_noisy_plate_stays_as_flat_as_it_is(noise: float, most_tilted_deg: float) -> None:
+    refined, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
+    assert mean_error_deg(refined) < 1.05 * mean_error_deg(pixelwise)
+    mean = unit(refined.normal_map.mean(axis=(0, 1)))
+    assert float(angle_between_deg(mean, PLATE[0, 0])) < most_tilted_deg
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss: float) -> None:
+    bright = (ROWS // 8 + COLUMNS // 8) % 2 == 1
+
+    def step_deg(estimate: NormalEstimate) -> float:
+        """The angle between the mean normals of the dark and of the bright squares."""
+        dark_mean, bright_mean = (unit(estimate.normal_map[part].mean(axis=0)) for part in (~bright, bright))
+        return float(angle_between_deg(dark_mean, bright_mean))
+
+    refined, pixelwise = refined_and_not(PLATE, np.where(bright, 0.8, 0.2), noise=0.005, gloss=gloss)
+    assert step_deg(refined) < step_deg(pixelwise) + 0.1
+
+
+def grooves(width: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Normals of grooves `width` pixels to either side, and their slopes of 17 degrees."""
+    slope = np.where((COLUMNS // width) % 2 == 1, 0.3, -0.3)
+    return unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1)), slope
+
+
+def depth(estimate: NormalEstimate, slope: NDArray[np.floating]) -> float:
+    """The mean slope along the grooves' own, of which 1 is true."""
+    found = -estimate.normal_map[..., 0] / estimate.normal_map[..., 2]
+    return float(((found - found.mean()) / slope).mean())
+
+
+@pytest.mark.parametrize(("width", "gloss"), [(1, 0.0), (1, 0.5), (4, 0.5)])
+def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
+    normals, slope = grooves(width)
+    refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
+    assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
+
+
+@pytest.mark.parametrize(("width", "noise"), [(1, 0.02), (2, 0.002)])
+def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -> None:
+    """They turn normals by many degrees, which says nothing about detail. The net alone takes most of it for noise."""
+    normals, slope = grooves(width)
+    stronger = 1 + 0.5 * (LIGHTS[:, 0] > 0)
+    refined, pixelwise = refined_and_not(normals, 0.5, noise=noise, unmeasured=stronger)
+    assert mean_error_deg(pixelwise) > 8
+    assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.15)
+
+
+@pytest.mark.parametrize("behind", [0.002, 0.3])
+def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
+    """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the sphere."""
+    size = 2 * SIZE  # halved, the two pixels at the rim of a smaller sphere would be too large a share
+    rows, columns = np.mgrid[:size, :size]
+    x, y = (columns - size / 2 + 0.5) / 36, (size / 2 - 0.5 - rows) / 36
+    height = np.sqrt((1 - x**2 - y**2).clip(0))
+    sphere = height > 0.2
+    normals = np.where(sphere[..., None], np.stack((x, y, height), axis=-1), PLATE[0, 0])
+    refined, pixelwise = (
+        angle_between_deg(estimate.normal_map[sphere], normals[sphere]).mean()
+        for estimate in refined_and_not(normals, np.where(sphere, 0.5, behind), noise=0.002)
+    )
+    assert refined < pixelwise + 0.3
+
+
+def test_seams_of_tiles_do_not_show() -> None:
+    """The margin of a tile is smaller than what the nets can see. Its share of a normal is far below its error."""
+    rows, columns = np.mgrid[:SEAMS, :SEAMS]
+    slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
+    normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))
+    capture = scene(normals, np.where(columns % 40 < 20, 0.8, 0.2), noise=0.01, gloss=0.5)
+    noise = np.random.default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
+    before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
+    errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
+    network = make_estimator("spline-net", MethodOptions(precision="float32")).refiner.network
+    found = []
+
+    def lighting_at(chosen: Any) -> PixelLighting:
+        return PixelLighting(capture.observations[chosen], LIGHTS)
+
+    for tile in (TILE, MARGIN):
+        refiner = NetworkRefiner(network, "float32", turns=1, tile=tile)
+        normals, errors = before.copy(), errors_before.copy()
+        refiner.refine(capture.mask, capture.observations, lighting_at, normals, errors)
+        found.append((normals, errors))
+    assert angle_between_deg(found[0][0], before).mean() > 0.2
+    assert angle_between_deg(found[0][0], found[1][0]).max() < 0.006  # 1e-4 radians
+    assert np.abs(found[0][1] - found[1][1]).max() < 0.006

@@ -1,0 +1,120 @@
+"""The blur of a lens, estimated and removed. The oracles are images of which the blur, or the sharp image, is known."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.scenes import shade, sphere_cap, spiral_lights
+
+from splinecli.capture.reader import capture_from_arrays
+from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
+
+Images = NDArray[np.float32]
+SIDE, FINER = 96, 4
+WHOLE = np.ones((SIDE, SIDE), np.bool_)
+NONE = np.zeros_like(WHOLE)
+
+
+def discs() -> Images:
+    """Eight images (F, H, W) of bright discs in different places before gray, with the true coverage of each pixel."""
+    rng = np.random.default_rng(0)
+    images = np.full((8, FINER * SIDE, FINER * SIDE), 0.2, np.float32)
+    for image in images:
+        for _ in range(12):
+            middle, radius = rng.integers(20, FINER * SIDE - 20, 2).tolist(), int(rng.integers(20, 60))
+            cv2.circle(image, middle, radius, 0.8, -1)  # type: ignore[call-overload]
+    return np.asarray(images.reshape(8, SIDE, FINER, SIDE, FINER).mean(axis=(2, 4)), np.float32)
+
+
+def blurred(images: Images, sigma: float) -> Images:
+    return np.stack([cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image for image in images])
+
+
+def removed(images: Images) -> tuple[Images, float | None]:
+    observations = np.ascontiguousarray(images.reshape(len(images), -1).T)
+    sigma = remove_blur(observations, WHOLE, NONE)
+    return observations.T.reshape(images.shape), sigma
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.7, 1.0])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_blur_is_found_and_removed(sigma: float, noise: float) -> None:
+    sharp = discs()
+    soft = blurred(sharp, sigma) + np.float32(noise) * np.random.default_rng(1).normal(size=sharp.shape)
+    found, estimate = removed(soft.astype(np.float32))
+    assert estimate == pytest.approx(sigma, abs=0.2)
+    before, after = (np.sqrt(np.square(images - sharp).mean()) for images in (soft, found))
+    assert after < before * (0.75 if noise == 0 else 1.1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_sharp_images_stay_as_they_are(noise: float) -> None:
+    images = (discs() + noise * np.random.default_rng(1).normal(size=(8, SIDE, SIDE))).astype(np.float32)
+    found, estimate = removed(images)
+    assert estimate is None
+    np.testing.assert_array_equal(found, images)
+
+
+def test_fine_texture_stays_as_it_is() -> None:
+    """Each pixel has an albedo of its own."""
+    rng = np.random.default_rng(2)
+    images = (rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1))).astype(np.float32)
+    assert removed(images)[1] is None
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+def test_images_without_edges_stay_as_they_are(gloss: float) -> None:
+    """Shading alone looks like the widest blur."""
+    shading = shade(sphere_cap(SIDE), spiral_lights(8, 60), gloss=gloss)
+    assert removed(np.moveaxis(shading, 2, 0).astype(np.float32))[1] is None
+    assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
+
+
+def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
+    """Wiener's transfer function, where power and noise are those of the docstring, and the filter is long enough."""
+    sigma = 0.7
+    frequency = np.array([1 / 8, 1 / 4])[:, None]
+    squared = np.add.outer(np.square(np.arange(33) / 64), np.square(np.arange(33) / 64))
+    mean_power = (1 / squared.clip(min=1 / 64**2)).mean()
+    g = np.exp(-2 * (np.pi * sigma * frequency) ** 2)
+    expected = g / (g**2 + NOISE * mean_power * frequency**2)
+    waves = np.cos(2 * np.pi * frequency * np.arange(-REACH, REACH + 1))
+    found = waves @ inverse_filter(sigma).sum(axis=0)
+    np.testing.assert_allclose(found, expected[:, 0], rtol=0.05)
+
+
+def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
+    """The observations of a disc are the same from the whole images as from a mask and the pixels around it."""
+    images = blurred(discs(), 0.7)
+    y, x = np.mgrid[:SIDE, :SIDE] - SIDE // 2
+    mask = np.hypot(x, y) < SIDE / 3
+    around = surroundings(mask)
+    assert not (mask & around).any()
+    part = np.concatenate((images[:, mask], images[:, around]), axis=1).T.copy()
+    assert remove_blur(part, mask, around) == pytest.approx(0.7, abs=0.2)
+    assert np.array_equal(part[mask.sum() :].T, images[:, around])
+    far = np.where(mask | around, images, 7)  # the filter must not see these
+    other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()
+    remove_blur(other, mask, around)
+    np.testing.assert_array_equal(part, other)
+
+
+def test_values_outside_the_mask_may_be_no_light() -> None:
+    images = blurred(discs(), 0.7)
+    mask = np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE // 2)) < SIDE / 3
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    images[3, ~mask] = np.nan
+    images[4, ~mask] = -1
+    capture = capture_from_arrays(images, lights, mask, light_intensities=np.ones(8))
+    assert capture.observations.shape == (mask.sum(), 8)
+    assert np.isfinite(capture.observations).all() and capture.observations.min() >= 0
+
+
+def test_stored_values_stay_as_they_are() -> None:
+    images = blurred(discs(), 0.7)
+    lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
+    capture = capture_from_arrays(images, lights, light_intensities=np.ones(8), as_stored=True)
+    assert capture.removed_blur is None
+    np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
+    sharpened = capture_from_arrays(images, lights, light_intensities=np.ones(8))
+    np.testing.assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)

@@ -1,0 +1,76 @@
+"""Circles from masks and in pictures."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splinecli.capture import read_image, read_mask
+from splinecli.errors import InputError
+from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circle
+
+TRUE = Circle(103.3, 88.7, 61.4)
+
+
+def assert_close(found: Circle, true: Circle, pixels: float) -> None:
+    differences = (found.x - true.x, found.y - true.y, found.radius - true.radius)
+    assert max(map(abs, differences)) < pixels
+
+
+@pytest.mark.parametrize("with_stand", [False, True])
+def test_circle_of_a_mask(with_stand: bool) -> None:
+    """A stand and specks do not move the circle."""
+    mask = TRUE.inside((180, 210))
+    if with_stand:
+        mask[130:, 90:118] = mask[5:8, 5:8] = True
+    found = circle_from_mask(mask)
+    assert_close(found, TRUE, 0.4 if with_stand else 0.2)
+    assert 0.5 < found.visible < 0.9 if with_stand else found.visible > 0.98 and found.spread < 0.5
+
+
+def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
+    beyond = Circle(40.0, 88.7, 61.4)
+    found = circle_from_mask(beyond.inside((180, 210)))
+    assert_close(found, beyond, 0.4)
+    assert found.reaches_beyond((180, 210))
+    assert not TRUE.reaches_beyond((180, 210))
+
+
+def test_masks_and_pictures_that_are_no_ball() -> None:
+    for mask in (np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)):
+        with pytest.raises(InputError, match="expected a ball"):
+            circle_from_mask(mask)
+    with pytest.raises(InputError, match="found no circle"):
+        find_circle(np.tile(np.linspace(0, 1, 200), (150, 1)))
+
+
+@pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
+@pytest.mark.parametrize("scale", [1, 6])
+def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
+    true = Circle(scale * TRUE.x, scale * TRUE.y, scale * TRUE.radius)
+    shape = (180 * scale, 210 * scale)
+    picture = np.where(true.inside(shape), ball, wall)
+    picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
+    found = find_circle(picture.clip(0))
+    assert_close(found, true, 0.5 * max(1, scale / 3))
+    assert found.visible > 0.9
+
+
+def test_normals_of_the_ball() -> None:
+    normals = Circle(10, 20, 5).normals(np.array([10.0, 13, 10, 16]), np.array([20.0, 20, 16, 20]))
+    np.testing.assert_allclose(normals[:3], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.8, 0.6)], atol=1e-12)
+    assert np.isnan(normals[3]).any()
+
+
+def test_real_balls(shared_data: Path, record_property: Callable[[str, object], None]) -> None:
+    # PSBox's own circles; their y counts from the lower edge.
+    for number in (1, 2):
+        folder = shared_data / f"psbox/LightProbe-{number}"
+        x, y, radius = (float(word) for word in (folder / "circle_data.txt").read_text().split())
+        picture = read_image(folder / "ref.JPG").mean(axis=2)
+        found = find_circle(picture)
+        record_property(f"ball {number}", repr(found))
+        assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
+    found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))
+    assert found.visible > 0.98

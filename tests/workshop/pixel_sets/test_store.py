@@ -1,0 +1,229 @@
+"""Pixel sets are read as they were written, and damaged ones are refused."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kills import content, killed_at
+from small_pixel_sets import MakeSet, matte_pixels
+from splinecli.errors import InputError, OutputError
+from splinecli.system.publishing import held_folder
+from splinecli.workshop.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSetWriter, open_pixel_set
+
+RECIPE = {"scenes": {"lights": 30}, "seed": 1}
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / MANIFEST).read_text())
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_round_trip(tmp_path: Path, dtype: type) -> None:
+    folder = tmp_path / "new" / "set"
+    writer = PixelSetWriter(folder)
+    written = {name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")}
+    for name, pixels in written.items():
+        writer.add(name, f"scene {name}", "a test", RECIPE, pixels)
+        assert name in writer
+    assert writer.describe("b") == "b: 7 pixels, 6 lights, a test"
+    finished = writer.finish()
+    opened = open_pixel_set(folder)
+    assert opened == finished
+    assert [entry.scene for entry in opened.entries] == ["scene a", "scene b"]
+    assert [(entry.n_pixels, entry.n_lights) for entry in opened.entries] == [(7, 5), (7, 6)]
+    for entry in opened.entries:
+        loaded = opened.load(entry)
+        for array in ARRAYS:
+            found, expected = getattr(loaded, array), getattr(written[entry.name], array)
+            assert found.dtype == expected.dtype and isinstance(found.base, np.memmap)
+            np.testing.assert_array_equal(found, expected)
+    assert opened.load(opened.entries[0]).observations.dtype == dtype
+    manifest = read_manifest(folder)
+    assert manifest["format"] == FORMAT
+    assert [entry["recipe"] for entry in manifest["entries"]] == [RECIPE, RECIPE]
+    assert (manifest["n_pixels"], manifest["complete"]) == (14, True)
+    assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
+
+
+def test_continuing_keeps_existing_entries(tmp_path: Path) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
+    again = PixelSetWriter(tmp_path)
+    assert "a" in again
+    again.add("b", "b", "a test", RECIPE, matte_pixels(3, 5))
+    assert again.finish() == open_pixel_set(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()} == before
+    # Entries may be added to a finished set. Until that is finished, training refuses the set.
+    more = PixelSetWriter(tmp_path)
+    assert len(open_pixel_set(tmp_path).entries) == 2
+    more.add("c", "c", "a test", RECIPE, matte_pixels(3, 5))
+    with pytest.raises(InputError, match="not finished"):
+        open_pixel_set(tmp_path)
+    assert len(more.finish().entries) == 3
+
+
+def test_recipes_are_compared(tmp_path: Path) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    writer = PixelSetWriter(tmp_path)
+    assert writer.difference("a", dict(reversed(RECIPE.items()))) is None
+    assert writer.difference("a", {**RECIPE, "seed": 2}) == "seed = 1, not 2"
+    assert writer.difference("a", {"seed": 1}) == "scenes = {'lights': 30}, not None"
+
+
+def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(tmp_path):
+    old, new, kept, step = matte_pixels(7, 5), matte_pixels(9, 4), [], 0
+    while True:
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        writer = PixelSetWriter(folder)
+        writer.add("a", "a", "a test", RECIPE, old)
+        writer.finish()
+
+        def replace(folder: Path = folder) -> None:
+            PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
+
+        if not killed_at(step, replace):
+            break
+        with held_folder(folder):
+            again = PixelSetWriter(folder)
+        kept.append(again.recipe_of("a") if "a" in again else None)
+        if kept[-1] == RECIPE:
+            assert [entry.n_pixels for entry in open_pixel_set(folder).entries] == [7]
+        else:
+            with pytest.raises(InputError, match="not finished"):
+                open_pixel_set(folder)
+            if kept[-1] is None:  # while its files changed, the set did not have the entry
+                replace()
+                again = PixelSetWriter(folder)
+            (entry,) = again.finish().entries
+            assert (entry.n_pixels, entry.recipe) == (9, {"seed": 2})
+            assert open_pixel_set(folder).entries == (entry,)
+        step += 1
+    assert RECIPE in kept
+    assert None in kept
+    assert {"seed": 2} in kept
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("\\begin")
+    with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
+        PixelSetWriter(tmp_path)
+    assert content(tmp_path) == {"thesis.tex": b"\\begin"}
+    with pytest.raises(OutputError, match="found a file, expected a folder"):
+        PixelSetWriter(tmp_path / "thesis.tex")
+
+
+@pytest.mark.parametrize(
+    ("manifest", "message"),
+    [
+        ({"name": "an app"}, "not the manifest of a pixel set: found format None"),
+        ({"format": FORMAT, "recipe": RECIPE, "entries": [{"name": "a"}]}, "the manifest is damaged"),
+    ],
+)
+def test_other_and_damaged_manifests_are_left_alone(tmp_path: Path, manifest: dict[str, Any], message: str) -> None:
+    text = json.dumps(manifest)
+    (tmp_path / MANIFEST).write_text(text)
+    with pytest.raises(InputError, match=message):
+        PixelSetWriter(tmp_path)
+    assert content(tmp_path) == {MANIFEST: text.encode()}
+
+
+def test_a_set_without_entries_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
+        PixelSetWriter(tmp_path / "empty").finish()
+        open_pixel_set(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+@pytest.mark.parametrize("entry", ["a", "b"])
+def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: str) -> None:
+    folder = make_set().folder
+    path = folder / entry / f"{array}.npy"
+    whole = path.read_bytes()
+    for position in (8, 127, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(InputError, match="does not match the manifest") as caught:
+            open_pixel_set(folder)
+        assert caught.value.path == path
+    path.write_bytes(whole)
+    open_pixel_set(folder)
+    path.unlink()
+    with pytest.raises(InputError, match=f"{entry}/{array}.npy: .*found no plain file"):
+        open_pixel_set(folder)
+
+
+DAMAGED: dict[str, Callable[[Path], object]] = {
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+    "link to nothing": lambda path: path.symlink_to("nothing"),
+    "empty": Path.touch,
+    "text": lambda path: path.write_text("no array"),
+    "header": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00\x10\x00{'descr': '<f4',"),
+    "archive": lambda path: np.savez(path.with_suffix(".npz"), 1),
+    "0-dimensional": lambda path: np.save(path, np.float32(1)),
+    "text array": lambda path: np.save(path, np.full((40, 30), "x")),
+    "too long": lambda path: np.save(path, np.ones((41, 30), np.float32)),
+    "complex": lambda path: np.save(path, np.ones((40, 3), np.complex64)),
+    "three axes": lambda path: np.save(path, np.ones((8, 5, 1), bool)),
+    "another mask": lambda path: np.save(path, np.ones((3, 5), bool)),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) -> None:
+    """`prepare` loads the arrays of a set to draw its overview, without looking at the checksums."""
+    pixel_set = make_set()
+    path = pixel_set.folder / "a" / f"{array}.npy"
+    path.unlink()
+    DAMAGED[damage](path)
+    with pytest.raises(InputError, match="does not match the manifest") as caught:
+        pixel_set.load(pixel_set.entries[0])
+    assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("n_pixels", 41, r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)"),
+        ("n_lights", 29, r"observations\.npy: .* expected \(40, 29\)"),
+        ("name", 2.5, r"manifest\.json: .*Expected `str`, got `float` - at `\$\.entries\[0\]\.name`"),
+        ("name", "../b", r"manifest\.json: '\.\./b' is not the name of a folder"),
+        ("sha256", {"observations": "0" * 64}, r"manifest\.json: .* \(the entry 'a' lacks a checksum\)"),
+        ("sha256", None, r"manifest\.json: .*Expected `object`, got `null` - at `\$\.entries\[0\]\.sha256`"),
+        ("name", "..", r"manifest\.json: '\.\.' is not the name of a folder"),
+        ("n_lights", "30", r"manifest\.json: .*Expected `int`"),
+        ("n_pixels", 0, r"manifest\.json: .*Expected `int` >= 1 - at"),
+        ("recipe", 5, r"manifest\.json: .*Expected `object`"),
+        ("name", "d", r"d/observations\.npy: does not match the manifest: found no plain file"),
+    ],
+)
+def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message: str) -> None:
+    folder = make_set().folder
+    manifest = read_manifest(folder)
+    manifest["entries"][0][key] = value
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=message):
+        open_pixel_set(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "not the manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
+        ('{"format": "splinecli-pixel-set-2"}', "found format 'splinecli-pixel-set-2', expected"),
+        (f'{{"format": "{FORMAT}", "complete": true}}', "Object missing required field"),
+    ],
+)
+def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
+    folder = make_set().folder
+    (folder / MANIFEST).write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        open_pixel_set(folder)
+    assert caught.value.path == folder / MANIFEST

@@ -1,0 +1,322 @@
+"""Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is left to chance."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import Tensor
+
+from distributions import SHARE, N, assert_uniform, generator
+from splinecli.materials.principled import PrincipledMaterial
+from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.observation_map import cell_directions, dot
+from splinecli.maths.transfer import decode_transfer
+from splinecli.workshop.synthesis.batches import (
+    add_sensor_noise,
+    disturb_light_directions,
+    disturb_light_intensities,
+    draw_exposure,
+    draw_light_intensities,
+    quantise,
+    restore,
+)
+from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.workshop.synthesis.pixels import Wall, draw_ambient, draw_visible_normals, draw_wall
+
+
+def test_walls_have_the_stated_shapes() -> None:
+    normals = draw_visible_normals(N, generator(1))
+    wall = draw_wall(normals, 0.4, generator())
+    present = wall.tan_height[:, 0] > 0
+    assert present.float().mean().item() == pytest.approx(0.4, abs=SHARE)
+    assert_uniform(torch.rad2deg(wall.tan_height[present].atan()), 8, 75)
+    assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
+    assert_uniform(wall.softness, 0.01, 0.06)
+    assert_uniform(torch.rad2deg(wall.facing[:, 2].asin()), 0, 60)
+    torch.testing.assert_close(wall.facing.norm(dim=1), torch.ones(N))
+    torch.testing.assert_close(wall.azimuth.norm(dim=1), torch.ones(N))
+    assert not wall.azimuth[:, 2].any()
+    # It faces back over the pixel.
+    assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
+    assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
+    assert not wall.reflectance[~present].any()
+    assert wall.has_pixel_material.float().mean().item() == pytest.approx(0.5, abs=SHARE)
+    # What reflects lies on the wall, on the side that faces the pixel.
+    torch.testing.assert_close(wall.towards.norm(dim=1), torch.ones(N))
+    along = (wall.towards * wall.azimuth).sum(dim=1)
+    assert (wall.towards[present, 2] < wall.tan_height[present, 0] * along[present]).all()
+    assert ((wall.facing * wall.towards).sum(dim=1) < 0).all()
+
+
+def matte(pixels: int) -> PrincipledMaterial:
+    """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection away."""
+    zero = torch.zeros(pixels, 1)
+    plain = {field.name: zero for field in fields(PrincipledMaterial)}
+    plain |= {"base": zero + 1, "roughness": zero + 0.1, "interface_loss": zero + 1e-9, "minnaert": zero + 1}
+    return PrincipledMaterial(**plain | {"tail_exponent": zero + 2, "second_roughness": zero + 1})
+
+
+def mirror(pixels: int) -> PrincipledMaterial:
+    return replace(matte(pixels), metallic=torch.ones(pixels, 1), roughness=torch.full((pixels, 1), 0.2))
+
+
+def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
+    normals = draw_visible_normals(50, generator(1))
+    wall = replace(draw_wall(normals, 1.0, generator()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool))
+    directions, inside = cell_directions()
+    cosine = dot(wall.facing, directions[inside]).clamp(min=0)
+    arriving = (normals * wall.towards).sum(dim=1, keepdim=True).clamp(min=0)
+    expected = wall.reflectance * arriving * cosine
+    returned = wall.reflected(normals, matte(50), directions[inside])
+    # An interface of no reflectance at normal incidence still mirrors a little at grazing angles.
+    steep = normals[:, 2] > 0.5
+    torch.testing.assert_close(returned[steep], expected[steep], rtol=0, atol=5e-3)
+    assert not wall.reflected(normals, matte(50), -wall.facing[:, None]).any()
+
+
+def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
+    """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall, to the camera."""
+    one, half = torch.ones(1, 1), math.sqrt(0.5)
+    side, facing = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[-half, 0.0, half]])
+    sizes = dict.fromkeys(("tan_height", "tan_half_width", "softness", "reflectance"), one)
+    wall = Wall(azimuth=side, towards=side, facing=facing, has_pixel_material=one > 0, **sizes)
+    # A wall at 45 degrees sends light from the zenith to the pixel, which faces camera and wall equally.
+    mirrored, elsewhere = [0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]
+    facing, away = torch.tensor([[half, 0.0, half]]), torch.tensor([[0.2, 0.0, math.sqrt(0.96)]])
+    lights = torch.tensor([mirrored, elsewhere])
+    seen = wall.reflected(facing, mirror(1), lights)[0]
+    assert seen[0] == pytest.approx(9)  # both highlights are limited to three times a matte white
+    assert seen[1] < 0.5
+    assert wall.reflected(away, mirror(1), lights).max() < 0.5
+
+
+def test_a_known_wall_hides_the_lights_behind_it() -> None:
+    wall = replace(
+        draw_wall(draw_visible_normals(1, generator()), 1.0, generator()),
+        azimuth=torch.tensor([[0.0, 1.0, 0.0]]),
+        tan_height=torch.tensor([[1.0]]),
+        tan_half_width=torch.tensor([[math.tan(math.radians(30))]]),
+        softness=torch.tensor([[0.01]]),
+    )
+
+    def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:
+        a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
+        return [math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]
+
+    # Azimuths from the wall's: 45 degrees high and 30 to either side.
+    lights = torch.tensor(
+        [towards(*a) for a in [(0, 40), (0, 50), (25, 20), (35, 20), (-25, 20), (-35, 20), (180, 10)]]
+    )
+    assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
+
+
+def test_ambient_light() -> None:
+    ambient = draw_ambient(N, 0.3, generator())
+    assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
+    assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
+    assert not draw_ambient(N, 0.0, generator()).any()
+
+
+def tilted_lights(pixels: int, lights: int) -> Tensor:
+    directions = torch.randn(pixels, lights, 3, generator=generator(3))
+    directions[..., 2] = directions[..., 2].abs() + 0.5
+    return torch.nn.functional.normalize(directions, dim=-1)
+
+
+def test_errors_of_light_directions() -> None:
+    directions = tilted_lights(4000, 40)
+    moved = disturb_light_directions(directions, 0.6, generator())
+    torch.testing.assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
+    assert (moved[..., 2] > 0).all()
+    error = angle_between_deg(moved.numpy(), directions.numpy())
+    # A pixel's angles have two components of its sigma each: sigma^2 is half of their mean square.
+    sigma = np.sqrt((error**2).mean(axis=1) / 2)
+    disturbed = sigma > 1e-6
+    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    # Sigma itself is estimated from 80 numbers, to 8 per cent.
+    assert stats.kstest(sigma[disturbed], lambda x: (x / 8).clip(0, 1) ** (1 / 3)).statistic < 0.04
+    assert 6 < sigma.max() < 10
+    np.testing.assert_allclose(disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6)
+
+
+def test_errors_of_light_intensities() -> None:
+    observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
+    factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
+    sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
+    disturbed = sigma > 1e-5
+    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
+    assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
+    assert torch.equal(disturb_light_intensities(observations, 0.0, generator()), observations)
+
+
+def test_exposure() -> None:
+    radiance = torch.rand(N, 5, generator=generator(3)) * 30
+    brightest = (radiance * draw_exposure(radiance, 0.25, generator())).amax(dim=1)
+    over = brightest > 1
+    assert over.float().mean().item() == pytest.approx(0.25, abs=SHARE)
+    assert_uniform(brightest[over], 1, 3)
+    dark = brightest < 10**-1.3
+    # U(-2.7, -0.7) for 40 %: seven tenths of it lie below -1.3.
+    assert dark[~over].float().mean().item() == pytest.approx(0.4 * 0.7, abs=SHARE)
+    assert_uniform(brightest[dark].log10(), -2.7, -1.3)
+    assert brightest.min() >= 10**-2.7 * 0.999
+    unclipped = (radiance * draw_exposure(radiance, 0.0, generator())).amax(dim=1)
+    assert unclipped.max() <= 1 + 1e-6
+    assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, generator())).all()
+
+
+def mean_square_of_power(low: float, high: float) -> float:
+    """E[(10^U(low, high))^2]."""
+    return (10 ** (2 * high) - 10 ** (2 * low)) / (2 * math.log(10) * (high - low))
+
+
+@pytest.mark.parametrize("level", [0.5, 0.1])
+def test_sensor_noise(level: float) -> None:
+    noisy = add_sensor_noise(torch.full((N, 20), level), generator())
+    expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
+    variance = (noisy.double() - level).square().mean().item()
+    assert variance == pytest.approx(expected, rel=0.05)
+    assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
+
+
+def is_multiple(values: Tensor, steps: float) -> Tensor:
+    """Whether all values (P, F) of a pixel are multiples of 1 / steps."""
+    return ((values * steps - (values * steps).round()).abs() < 1e-6).all(dim=1)
+
+
+def test_quantisation() -> None:
+    exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
+    quantised = quantise(exposed, 0.3, generator())
+    decoded = torch.from_numpy(decode_transfer(np.arange(256, dtype=np.float32) / 255, None)).double()
+    of_srgb = (quantised[..., None] - decoded).abs().amin(dim=2).amax(dim=1) < 1e-6
+    eight = is_multiple(quantised, 255)
+    assert of_srgb.double().mean().item() == pytest.approx(0.15, abs=SHARE)
+    assert eight.double().mean().item() == pytest.approx(0.15, abs=SHARE)
+    error = quantised - exposed
+    # The high byte of 16 is up to a step of 255 too dark or, as 256 steps become 255, a little too bright.
+    cut = eight & (error.abs().amax(dim=1) > 0.5001 / 255)
+    assert 0.06 < cut.double().mean().item() <= 0.075 + SHARE
+    assert (error[cut].mean() * 255).item() == pytest.approx(0, abs=0.02)
+    assert error[eight & ~cut].abs().max().item() <= 0.5001 / 255
+    for bits in (10, 12, 14, 16):
+        other = is_multiple(quantised, 2**bits - 1) & ~eight & ~of_srgb
+        assert other.double().mean().item() == pytest.approx(0.7 / 4, abs=SHARE)
+        assert error[other].abs().max().item() == pytest.approx(0.5 / (2**bits - 1), rel=0.01)
+    assert (quantise(exposed, 0.0, generator()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
+
+
+def test_light_intensities() -> None:
+    intensities = draw_light_intensities(N, 10, 0.4, generator())
+    assert intensities.amax(dim=1).sub(1).abs().max() == 0
+    unequal = intensities.amin(dim=1) < 1
+    assert unequal.float().mean().item() == pytest.approx(0.4, abs=SHARE)
+    # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's upper end by that.
+    assert intensities.min() >= 0.25
+    assert not (draw_light_intensities(N, 10, 0.0, generator()) != 1).any()
+
+
+def test_restoring_half_of_the_clipped_pixels() -> None:
+    lights = tilted_lights(400, 12)
+    normals = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1)))
+    truth = (lights * normals[:, None]).sum(dim=2).clamp(min=0)
+    truth = 1.4 * truth / truth.amax(dim=1, keepdim=True)
+    valid = torch.arange(12).expand(400, 12) < 10
+    clipped = (truth > 1) & valid
+    stored = truth.clamp(max=1) * valid
+    restored = restore(stored, clipped, lights, valid, generator())
+    changed = (restored != stored).any(dim=1)
+    assert changed.float().mean().item() == pytest.approx(0.5, abs=0.08)
+    assert not (restored != stored)[~clipped].any()
+    # Seven matte observations determine the others.
+    known = changed & ((valid & ~clipped).sum(dim=1) >= 7)
+    assert known.sum() > 20
+    assert (restored - truth)[known][clipped[known]].abs().max() < 0.02
+
+
+def draw_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
+    random = torch.Generator().manual_seed(0)
+    return draw_light_directions(pixels, lights, random, {kind: 1.0}).double().numpy()
+
+
+def centred_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
+    points = draw_rigs(kind, pixels, lights)[..., :2]
+    return points - points.mean(axis=1, keepdims=True)
+
+
+def test_half_of_the_draws_have_about_the_usual_number() -> None:
+    random = torch.Generator().manual_seed(0)
+    draws = [draw_light_counts(50, 4, 96, 10, random).numpy() for _ in range(4000)]
+    largest = np.array([counts.max() for counts in draws])
+    assert largest.min() >= 4
+    assert largest.max() >= 90
+
+    def log_uniform(most: int) -> float:
+        return math.log((most + 1) / 4) / math.log(97 / 4)
+
+    # Four standard deviations of a share of 4000 are at most 0.03.
+    for most in (7, 20, 50):
+        expected = 0.5 * log_uniform(most) + 0.5 * (most >= 12)
+        assert (largest <= most).mean() == pytest.approx(expected, abs=0.035)
+    assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
+
+
+def test_directions_are_unit_vectors_above_the_horizon() -> None:
+    directions = draw_light_directions(2000, 30, torch.Generator().manual_seed(0))
+    assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
+    # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
+    assert directions[..., 2].min() == pytest.approx(0.0894, abs=1e-3)
+
+
+def test_rigs_are_ellipses_of_the_stated_axes() -> None:
+    centred = centred_rigs("ellipse", 1500, 1000)
+    # A uniform ellipse has variances of a quarter of its half-axes squared.
+    axes = 2 * np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 1000))
+    small = axes[:, 1] < math.sin(math.radians(40))  # no rig this small is cut by the rim
+    assert small.sum() > 300
+    # sin U(20, 88) degrees, seen through an estimate of some per cent: 20 is blurred.
+    largest_deg = np.degrees(np.arcsin(axes[small, 1]))
+    assert largest_deg.min() > 18.5
+    assert stats.kstest(largest_deg, stats.uniform(20, 20).cdf).pvalue > 1e-3
+    assert small.mean() == pytest.approx(20 / 68, abs=0.05)
+    assert stats.kstest(axes[small, 0] / axes[small, 1], stats.uniform(0.5, 0.5).cdf).statistic < 0.07
+
+
+def test_cones_are_narrow() -> None:
+    centred = centred_rigs("cone", 500, 400)
+    radius_deg = np.degrees(np.arcsin(np.linalg.norm(centred, axis=2).max(axis=1)))
+    # The mean of 400 lights is off by some hundredths of the radius.
+    assert stats.kstest(radius_deg, stats.uniform(8, 12).cdf).statistic < 0.15
+    assert radius_deg.max() < 22
+
+
+def test_rings_have_one_elevation() -> None:
+    directions = draw_rigs("ring", 500, 200)
+    polar_deg = np.degrees(np.arccos(directions[..., 2]))
+    assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
+    assert np.median(polar_deg.std(axis=1)) == pytest.approx(2, abs=0.15)
+    # The mean direction of a whole ring is the view axis. An arc of A has sin(A / 2) / (A / 2) of a ring's radius.
+    off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(np.radians(polar_deg.mean(axis=1)))
+    assert 0.4 < (off_axis < 0.03).mean() < 0.6
+    assert off_axis.max() < math.sin(math.radians(60)) / math.radians(60) + 0.05
+
+
+def test_lines_lie_nearly_in_a_plane() -> None:
+    centred = centred_rigs("line", 500, 400)
+    across = np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 400)[:, 0])
+    assert stats.kstest(np.degrees(np.arcsin(across)), stats.uniform(1, 9).cdf).statistic < 0.1
+
+
+def test_hand_held_lights_come_in_clusters() -> None:
+    directions = draw_rigs("hand-held", 500, 12)
+    angles = np.degrees(np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1)))
+    angles += 360 * np.eye(12)
+    polar_deg = np.degrees(np.arccos(directions[..., 2]))
+    assert polar_deg.min() > 20 - 24 and np.median(polar_deg) == pytest.approx(45, abs=3)
+    # Three of four rigs have at least two lights a cluster, which are 6 sqrt(2) degrees apart on average, or closer
+    # where a turn about the axis moves them less.
+    assert (np.median(angles.min(axis=2), axis=1) < 12).mean() > 0.6

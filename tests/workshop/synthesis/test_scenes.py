@@ -1,0 +1,67 @@
+"""Scenes: reproducible one by one, and drawn from the stated ranges."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("embreex", reason="needs the extra 'render'")
+
+from splinecli.workshop.synthesis.meshes import Mesh
+from splinecli.workshop.synthesis.scenes import (
+    MATERIALS,
+    MIN_LIGHT_Z,
+    SceneConfig,
+    draw_lights,
+    draw_scene,
+    render_scene,
+)
+
+SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
+
+
+def tent() -> Mesh:
+    """Two slopes that meet in a valley along y."""
+    corners = np.array([(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32)
+    faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)], np.int32)
+    slope = np.sqrt(0.5)
+    normals = np.array([(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2)
+    return Mesh(corners, faces, normals.astype(np.float32))
+
+
+def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
+    scenes = [draw_scene(7, index, SMALL, tent()) for index in (0, 1, 0)]
+    rendered = [render_scene(scene, SMALL) for scene in scenes]
+    for name in MATERIALS:
+        assert np.array_equal(rendered[0].observations[name], rendered[2].observations[name])
+        assert not np.array_equal(rendered[0].observations[name], rendered[1].observations[name])
+    for other in (scenes[1], draw_scene(8, 0, SMALL, tent())):
+        assert not np.array_equal(scenes[0].lights, other.lights)
+
+
+def test_what_is_rendered() -> None:
+    rendered = render_scene(draw_scene(0, 2, SMALL, tent()), SMALL)
+    pixels = rendered.mask.sum()
+    assert rendered.mask.shape == (16, 16)
+    assert pixels == 256  # the slopes fill the frame
+    assert rendered.normals.shape == (pixels, 3)
+    for observations in (rendered.observations[name] for name in MATERIALS):
+        assert (observations.shape, observations.dtype) == ((pixels, 24), np.float32)
+        assert np.isfinite(observations).all() and (observations >= 0).all()
+    # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
+    direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
+    alone = render_scene(draw_scene(0, 2, direct, tent()), direct)
+    for name in MATERIALS:
+        added = rendered.observations[name] - alone.observations[name]
+        assert added.min() > -1e-6
+        assert added.mean() > 0.01 * alone.observations[name].mean()
+
+
+def test_lights_cover_the_upper_hemisphere() -> None:
+    lights = draw_lights(500, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(lights, axis=1), 1, atol=1e-5)
+    assert (lights[:, 2] > MIN_LIGHT_Z).all()
+    # Uniform by solid angle: z is uniform over 0..1, and every direction has a light within a few mean distances.
+    assert np.histogram(lights[:, 2], bins=5, range=(0, 1))[0] == pytest.approx(100, abs=15)
+    probes = np.random.default_rng(1).normal(size=(500, 3))
+    probes[:, 2] = np.abs(probes[:, 2])
+    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12

@@ -1,0 +1,263 @@
+"""Procedural shapes: sound surfaces, true normals, hollows, fields against closed forms; meshes as files give them."""
+
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.errors import InputError
+from splinecli.workshop.synthesis import meshes
+from splinecli.workshop.synthesis.meshes import REACH, Floats, Mesh, fit_to_frame, read_mesh, split_long_edges
+from splinecli.workshop.synthesis.shapes import KINDS, Relief, draw_detail, draw_shape_of_kind, read_relief
+
+pytest.importorskip("skimage", reason="needs the extra 'render'")
+
+
+def points(count: int = 2000, seed: int = 0) -> Floats:
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        meshes.ellipsoid(np.full(3, 0.5, np.float32)),
+        meshes.box(np.array((0.5, 0.3, 0.7), np.float32), 0.1),
+        meshes.torus(0.5, 0.2),
+        meshes.capsule(0.4, 0.2),
+    ],
+)
+def test_solids_are_true_distances(field: meshes.Field) -> None:
+    at = points()
+    slope = np.linalg.norm(meshes.gradient(field, at), axis=1)
+    # But on the creases of the box's inside and on axes, which few points are near, distance grows at unit rate.
+    assert np.abs(slope - 1).mean() < 0.01
+    # And a step along it by the distance meets the surface.
+    foot = at - field(at)[:, None] * meshes.gradient(field, at)
+    outside = field(at) > 0.01
+    assert np.abs(field(foot))[outside].max() < 2e-3
+
+
+def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
+    first, second = points(seed=1)[:, 0], points(seed=2)[:, 0]
+    union = meshes.smooth_union(first, second, 0.1)
+    apart = np.abs(first - second) > 0.1
+    np.testing.assert_array_equal(union[apart], np.minimum(first, second)[apart])
+    below = np.minimum(first, second) - union
+    assert below.min() >= -1e-7
+    assert below.max() == pytest.approx(0.025, abs=1e-3)  # a quarter of the blend, where both are alike
+    cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
+    np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
+
+
+def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
+    mesh = meshes.triangulate(meshes.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
+    assert np.abs(meshes.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
+    ring = mesh.vertices * (1, 1, 0)
+    centre = 0.6 * ring / np.linalg.norm(ring, axis=1, keepdims=True)
+    expected = (mesh.vertices - centre) / 0.25
+    assert (expected * mesh.vertex_normals).sum(axis=1).min() > 0.9999
+    # Anticlockwise from outside, closed, and of the volume 2 pi^2 R r^2.
+    assert outward_volume(mesh) == pytest.approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
+
+
+def test_crumbs_and_the_empty_field_are_dropped() -> None:
+    def two_balls(at: Floats) -> Floats:
+        large = np.linalg.norm(at, axis=1) - np.float32(0.5)
+        small = np.linalg.norm(at - np.float32(0.8), axis=1) - np.float32(0.1)
+        return np.minimum(large, small)
+
+    mesh = meshes.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
+    assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.51
+    assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
+
+
+def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = meshes.waves(np.random.default_rng(0), 1.0)
+
+    def lumps(at: Floats) -> Floats:
+        return np.linalg.norm(at, axis=1) - np.float32(0.6) - np.float32(0.05) * noise(at)
+
+    sparse = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    monkeypatch.setattr(meshes, "COARSE", 1)
+    dense = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    assert len(sparse.faces) == len(dense.faces)
+    np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A coarser field, for speed.
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.025)
+    mesh = draw_shape_of_kind(kind, np.random.default_rng(5))
+    assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
+    assert mesh.faces.min() == 0 and mesh.faces.max() == len(mesh.vertices) - 1
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
+    assert outward_volume(mesh) > 0
+    reach = np.abs(mesh.vertices[:, :2]).max()
+    # A relief goes beyond the frame, so that no pixel sees its edge.
+    assert reach > 1 if kind == "relief" else reach == pytest.approx(REACH, abs=1e-4)
+    corners = mesh.vertices[mesh.faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    agreement = (facing * mesh.vertex_normals[mesh.faces].mean(axis=1)).sum(axis=1)
+    # Facets turn away from the field's normals in creases alone.
+    assert np.quantile(agreement, 0.1) > 0.9
+    # A convex body lies on one side of all its tangent planes; of these surfaces a good part lies outside some.
+    rng = np.random.default_rng(0)
+    here, there = (rng.integers(len(mesh.vertices), size=4000) for _ in range(2))
+    above = ((mesh.vertices[there] - mesh.vertices[here]) * mesh.vertex_normals[here]).sum(axis=1) > 0.02
+    assert above.mean() > 0.03
+
+
+SIDE = 64
+ALONG, DOWN = np.meshgrid((np.arange(SIDE) + 0.5) / SIDE, (np.arange(SIDE) + 0.5) / SIDE)
+HEIGHT_SLOPES = np.stack(
+    (0.6 * np.cos(2 * np.pi * (ALONG + DOWN)), 0.6 * np.cos(2 * np.pi * (ALONG + DOWN))), axis=2
+).astype(np.float32)
+"""The slopes of the height 0.3 / pi sin(2 pi (u + v)) along columns and rows."""
+
+
+@pytest.mark.parametrize("green_up", [True, False])
+def test_slopes_are_found_whichever_way_green_points(tmp_path: Path, green_up: bool) -> None:
+    normals = np.dstack((-HEIGHT_SLOPES, np.ones((SIDE, SIDE))))
+    normals[..., 1] *= -1 if green_up else 1
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    path = tmp_path / "waves.png"
+    cv2.imwrite(str(path), np.rint((normals + 1) / 2 * 65535).astype(np.uint16)[..., ::-1])
+    np.testing.assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
+
+
+def test_a_gray_image_is_no_relief(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "gray.png"), np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match="found a gray image, expected a normal map"):
+        read_relief(tmp_path / "gray.png")
+
+
+def test_a_plate_gets_the_normals_of_the_height() -> None:
+    relief = Relief(HEIGHT_SLOPES, np.eye(3, dtype=np.float32), period=0.5)
+    places = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
+    places[:, 2] = 0
+    up = np.tile(np.float32((0, 0, 1)), (500, 1))
+    slope = 0.6 * np.cos(2 * np.pi * (places[:, 0] + places[:, 1]) / 0.5)
+    expected = np.stack((-slope, -slope, np.ones(500)), axis=1)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    off = np.degrees(np.arccos(np.clip((relief.bend(up, places) * expected).sum(axis=1), -1, 1)))
+    assert off.max() < 4.5  # half a texel of 64 along both axes
+
+
+def test_no_normal_turns_away_from_the_camera() -> None:
+    rng = np.random.default_rng(1)
+    normals = rng.normal(size=(4000, 3)).astype(np.float32)
+    normals[:, 2] = np.abs(normals[:, 2])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    relief = draw_detail(6 * HEIGHT_SLOPES, 128, np.random.default_rng(3))
+    bent = relief.bend(normals, rng.uniform(-1, 1, (4000, 3)).astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
+    assert (bent[:, 2] >= np.minimum(normals[:, 2], 0.1) - 1e-3).all()
+    assert np.degrees(np.arccos(np.clip((bent * normals).sum(axis=1), -1, 1))).mean() > 3
+
+
+trimesh: Any = pytest.importorskip("trimesh", reason="needs the extra 'render'")
+
+
+def outward_volume(mesh: Mesh) -> float:
+    """The volume that the faces enclose: positive where they are anticlockwise from outside."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def area(mesh: Mesh) -> float:
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(np.linalg.norm(facing, axis=1).sum() / 2)
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "stl_ascii", "off"])
+def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"ball.{ending}"
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40))
+    ball.export(path, file_type=ending)
+    mesh = read_mesh(path)
+    assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
+    assert np.abs(mesh.vertices).max() == pytest.approx(REACH, abs=1e-3)
+    # Normals interpolated along the edges of a fine ball stay within its facets' own angles.
+    outward = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    assert (outward * mesh.vertex_normals).sum(axis=1).min() > 0.999
+    edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
+    assert np.linalg.norm(edges, axis=2).max() <= 0.03
+
+
+def test_the_wider_side_fits_and_the_shape_is_kept() -> None:
+    box = trimesh.creation.box((4.0, 1.0, 2.0))
+    vertices = box.vertices.astype(np.float32) + np.float32(3)
+    mesh = fit_to_frame(Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32)))
+    extent = np.ptp(mesh.vertices, axis=0)
+    np.testing.assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
+    np.testing.assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
+
+
+def test_a_ball_inside_out_is_turned(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.invert()
+    ball.export(tmp_path / "inverted.ply")
+    assert outward_volume(read_mesh(tmp_path / "inverted.ply")) > 0
+
+
+def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path: Path) -> None:
+    (tmp_path / "blank.obj").write_text("\n" * 2_000_000)
+    started = time.process_time()
+    with pytest.raises(InputError):
+        read_mesh(tmp_path / "blank.obj")
+    assert time.process_time() - started < 3  # the square took an hour
+
+
+def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
+    fine = split_long_edges(mesh, longest=0.1)
+    assert len(fine.faces) > 600
+    assert area(fine) == pytest.approx(area(mesh), rel=1e-6)
+    assert outward_volume(fine) == pytest.approx(outward_volume(mesh), rel=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
+    # What is fine enough already stays as it is, and the number of faces has its limit.
+    assert len(split_long_edges(mesh, longest=2.0).faces) == len(mesh.faces)
+    assert len(split_long_edges(mesh, longest=0.01, most_faces=5000).faces) <= 5000
+
+
+def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
+    for name, text, reason in (
+        ("broken.ply", "ply, but not really", r"broken\.ply: not a mesh that can be read"),
+        ("notes.txt", "nothing but words", "not a mesh that can be read"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", r"points\.obj: .*(no faces|not a mesh)"),
+        # A triangle seen from its edge alone, along the viewing direction, has no width in the image.
+        ("needle.obj", "v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n", "no extent that a camera along -z could see"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=reason):
+            read_mesh(tmp_path / name)
+
+
+def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere()
+    for ending in ("zip", "ply"):
+        with zipfile.ZipFile(tmp_path / f"archive.{ending}", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.ply", ball.export(file_type="ply"))
+        with pytest.raises(InputError, match=r"not a mesh that can be read .*is in none of these formats"):
+            read_mesh(tmp_path / f"archive.{ending}")
+    ball.export(tmp_path / "ball.glb")
+    with pytest.raises(InputError, match="Give a triangle mesh as PLY, OBJ, STL or OFF"):
+        read_mesh(tmp_path / "ball.glb")
+
+
+def test_large_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "long.obj").write_bytes(b"v 0 0 0\n" + b" " * 32_000_000)
+    with pytest.raises(InputError, match=r"long\.obj: found a longer file than 32 MB"):
+        read_mesh(tmp_path / "long.obj")
+    (tmp_path / "fan.obj").write_bytes(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + b" 1 2 3" * 700)
+    monkeypatch.setattr(meshes, "MOST_FACES", 2000)
+    with pytest.raises(InputError, match=r"fan\.obj: found 2098 triangles, expected at most 2000"):
+        read_mesh(tmp_path / "fan.obj")
