@@ -2,11 +2,12 @@
 
     python benchmarks/all_figures.py DATA [--results runs/figures] [--only NAME ...] [--again]
 
-DATA has the folders DiLiGenT/pmsData, synth/L17, statues, uw, psbox and merl_nbrdf. Everything together takes hours on
-two cores. Each row is stored in docs/figures.json when it is done, with the version and the weights. Rows of the
-shipped weights, and of fits, which earlier versions may have measured, are not measured again. A stopped evaluation
-goes on in --results. --only names measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they
-are named, because they need a quiet machine.
+DATA has the folders DiLiGenT/pmsData, synth/L17, statues, uw, psbox and merl_nbrdf. Everything
+together takes hours on two cores. Each row is stored in docs/figures.json when it is done, with the
+version and the weights. Rows of the shipped weights, and of fits, which earlier versions may have
+measured, are not measured again. A stopped evaluation goes on in --results. --only names
+measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named,
+because they need a quiet machine.
 """
 
 from __future__ import annotations
@@ -54,18 +55,30 @@ class Bench:
     def synth(self) -> dict[str, Path]:
         return {name: self.data / "synth/L17" / name.replace(" ", "_") for name in SYNTH}
 
-    def errors(self, folder: str, captures: Mapping[str, Path], method: str, **options: Any) -> list[Cells]:
-        """Return {"label", "n_lights", "light_noise_deg", "mae_deg"} of each evaluation of a method."""
+    def errors(
+        self, folder: str, captures: Mapping[str, Path], method: str, **options: Any
+    ) -> list[Cells]:
+        """Return {"label", "n_lights", "light_noise_deg", "mae_deg"} of each evaluation of a
+        method.
+        """
         from splinecli.pipeline.evaluate import evaluate_captures
         from splinecli.pipeline.options import EvaluateOptions
 
         chosen = {"trials": self.trials, "max_pixels": 2000, "as_stored": True, **options}
-        chosen |= {"methods": (method,), "output": str(self.results / folder), "datasets": tuple(captures.values())}
+        chosen |= {
+            "methods": (method,),
+            "output": str(self.results / folder),
+            "datasets": tuple(captures.values()),
+        }
         document = evaluate_captures(EvaluateOptions(**chosen)).document
         labels = {path.name: label for label, path in captures.items()}
         # mae_deg has four decimals; rounding it again may differ from what evaluate prints.
         return [
-            {**result, "label": labels[result["capture"]], "mae_deg": round(fmean(result["maes_deg"]), 4)}
+            {
+                **result,
+                "label": labels[result["capture"]],
+                "mae_deg": round(fmean(result["maes_deg"]), 4),
+            }
             for result in document["results"]
         ]
 
@@ -89,14 +102,23 @@ class Bench:
         cells: Cells = {}
         for how, refine in (("given", False), ("refined", True)):
             found = self.errors(
-                f"refined-{how}", self.objects, method, light_noise_deg=(0.0, 4.0, 8.0), refine_lights=refine
+                f"refined-{how}",
+                self.objects,
+                method,
+                light_noise_deg=(0.0, 4.0, 8.0),
+                refine_lights=refine,
             )
             cells |= means(found, lambda r, how=how: f"{r['light_noise_deg']:g} {how}")  # type: ignore[misc]
         return cells
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
-        """Score copies of the captures whose images have other bits, on all pixels under two draws."""
-        copies = {label: rewritten(path, self.results / name, convert) for label, path in self.objects.items()}
+        """Score copies of the captures whose images have other bits,
+        on all pixels under two draws.
+        """
+        copies = {
+            label: rewritten(path, self.results / name, convert)
+            for label, path in self.objects.items()
+        }
         cells: Cells = {}
         for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
             found = self.errors(f"{name} errors", copies, method, trials=2, max_pixels=None)
@@ -104,24 +126,41 @@ class Bench:
         return cells
 
     def optics(self, convert: Callable[[Any], Any], name: str) -> Cells:
-        """Score the statues after a camera, on all pixels under one draw of ten lights, restored as `infer` does."""
+        """Score the statues after a camera, on all pixels under one draw of ten lights, restored as
+        `infer` does.
+        """
         captures = {label: self.data / "statues" / label for label in tables.STATUES}
-        copies = {label: rewritten(path, self.results / name, convert) for label, path in captures.items()}
+        copies = {
+            label: rewritten(path, self.results / name, convert) for label, path in captures.items()
+        }
         cells: Cells = {}
         for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
-            options = {"trials": 1, "seed": 3, "n_lights": (10,), "max_pixels": None, "as_stored": False}
+            options = {
+                "trials": 1,
+                "seed": 3,
+                "n_lights": (10,),
+                "max_pixels": None,
+                "as_stored": False,
+            }
             found = self.errors(f"{name} errors", copies, method, **options)
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
 
     def relighting(self, label: str) -> Cells:
-        """Compare renderings under the lights that a draw of ten leaves out with the photographs, in decibels."""
+        """Compare renderings under the lights that a draw of ten leaves out with the photographs,
+        in decibels.
+        """
         from splinecli.pipeline.evaluate import evaluate_captures
         from splinecli.pipeline.options import EvaluateOptions
 
         output = str(self.results / "relighting" / label)
         options = EvaluateOptions(
-            datasets=(self.objects[label],), n_lights=(10,), trials=1, max_pixels=2000, relight=True, output=output
+            datasets=(self.objects[label],),
+            n_lights=(10,),
+            trials=1,
+            max_pixels=2000,
+            relight=True,
+            output=output,
         )
         [found] = evaluate_captures(options).document["relighting"]
         return {kind: found[kind]["psnr_db"] for kind in tables.PICTURES.values()}
@@ -166,17 +205,25 @@ class Bench:
         network = resolve_weights("spline-net").network
         draws = photographs.read_draws({**self.objects, **self.synth}[capture], 2, 1500)
         exposed = np.mean([photographs.overexposed(network, draw) for draw in draws], axis=0)
-        unknown = np.mean([photographs.without_intensities(network, draw)[1] for draw in draws], axis=0)
+        unknown = np.mean(
+            [photographs.without_intensities(network, draw)[1] for draw in draws], axis=0
+        )
         return {
             name: round(float(value), 4)
-            for name, value in zip((*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True)
+            for name, value in zip(
+                (*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True
+            )
             if np.isfinite(value)  # without its saturated values, a pixel may have too few
         }
 
     def confidence(self, capture: str) -> Cells:
-        """In percent: pixels within 5 degrees as expected and found; the worst tenth's share in the least sure."""
+        """In percent: pixels within 5 degrees as expected and found; the worst tenth's share in the
+        least sure.
+        """
         shares = []
-        for estimate in self.estimates({**self.objects, **self.synth}[capture], "spline-net", trials=self.trials):
+        for estimate in self.estimates(
+            {**self.objects, **self.synth}[capture], "spline-net", trials=self.trials
+        ):
             assert estimate.errors is not None and estimate.error_map_deg is not None
             assert estimate.confidence_map is not None and estimate.expected_under_5 is not None
             known = np.isfinite(estimate.error_map_deg)
@@ -186,13 +233,18 @@ class Bench:
             shares.append((estimate.expected_under_5, estimate.errors.under_5, caught))
         return {
             name: round(100 * float(share), 2)
-            for name, share in zip(("expected", "found", "worst tenth"), np.mean(shares, axis=0), strict=True)
+            for name, share in zip(
+                ("expected", "found", "worst tenth"), np.mean(shares, axis=0), strict=True
+            )
         }
 
     def wrong_lights(self) -> dict[str, Cells]:
         import wrong_lights
 
-        captures = [*self.objects.values(), *(self.data / name for name in ("uw/gray", "uw/horse", "psbox"))]
+        captures = [
+            *self.objects.values(),
+            *(self.data / name for name in ("uw/gray", "uw/horse", "psbox")),
+        ]
         counts = wrong_lights.count(captures, 12, draws=4, n_lights=12)
         return {kind: wrong_lights.grouped(kind, found) for kind, found in counts.items()}
 
@@ -200,11 +252,17 @@ class Bench:
         import near_lamps
 
         rows = near_lamps.measure("spline-net-pixelwise", 40, (2, 4, 8), ())
-        return {scene: {name: round(error, 4) for name, (error, _) in cells} for scene, cells in rows}
+        return {
+            scene: {name: round(error, 4) for name, (error, _) in cells} for scene, cells in rows
+        }
 
     def calibration(self) -> dict[str, Cells]:
         from splinecli.capture.light_files import read_light_directions
-        from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
+        from splinecli.lights.calibration.balls import (
+            calibrate_ball,
+            combine_balls,
+            find_ball_files,
+        )
         from splinecli.maths.normals import angle_between_deg
 
         probes = [self.data / f"psbox/LightProbe-{number}" for number in (1, 2)]
@@ -216,20 +274,29 @@ class Bench:
         )
         rows: dict[str, Cells] = {}
         for name, (balls, lights) in zip(tables.MIRROR_BALLS, cases, strict=True):
-            found = combine_balls([calibrate_ball(find_ball_files(ball)) for ball in balls]).directions
+            found = combine_balls(
+                [calibrate_ball(find_ball_files(ball)) for ball in balls]
+            ).directions
             angles = angle_between_deg(read_light_directions(lights, len(found)), found)
-            rows[name] = {"mean": round(float(angles.mean()), 4), "largest": round(float(angles.max()), 4)}
+            rows[name] = {
+                "mean": round(float(angles.mean()), 4),
+                "largest": round(float(angles.max()), 4),
+            }
         return rows
 
     def distilled(self, label: str) -> Cells:
-        """Mean errors of the whole of `infer` under ten lights: every pixel by the network, or most by a small one."""
+        """Mean errors of the whole of `infer` under ten lights: every pixel by the network, or most
+        by a small one.
+        """
         from splinecli.pipeline.infer import infer_capture
         from splinecli.pipeline.infer_options import InferOptions
 
         cells: Cells = {}
         for name, distils in (("network", False), ("distilled", True)):
             options = InferOptions(n_lights=10, distil=distils, output=str(self.results / name))
-            cells[name] = round(infer_capture(self.objects[label], options)["angular_error_deg"]["mean"], 4)
+            cells[name] = round(
+                infer_capture(self.objects[label], options)["angular_error_deg"]["mean"], 4
+            )
         return cells
 
     def speed(self) -> dict[str, Cells]:
@@ -237,14 +304,22 @@ class Bench:
 
         speeds = inference_speed.speeds(16_384, 3)
         paper = speeds["layers of the paper, float32"]
-        return {name: {"pixels/s": speed, "relative": speed / paper} for name, speed in speeds.items()}
+        return {
+            name: {"pixels/s": speed, "relative": speed / paper} for name, speed in speeds.items()
+        }
 
     def size(self, megapixels: str) -> Cells:
         import large_captures
 
         seconds, report = large_captures.measure(float(megapixels), "spline-net", "png,npy")
         names = ("processor s", "memory MiB", "processor s a megapixel")
-        return dict(zip(names, (seconds, report["peak_memory_mib"], seconds / float(megapixels)), strict=True))
+        return dict(
+            zip(
+                names,
+                (seconds, report["peak_memory_mib"], seconds / float(megapixels)),
+                strict=True,
+            )
+        )
 
     def measurements(self) -> dict[str, Rows]:
         """Return what measures each row of each measurement."""
@@ -259,14 +334,20 @@ class Bench:
         return {
             "calibration": each(self.calibration, tables.MIRROR_BALLS),
             **{
-                f"lights-{count}": {m: partial(self.lights, m, count) for m in (*FITS, *NETWORKS, RESTORED)}
+                f"lights-{count}": {
+                    m: partial(self.lights, m, count) for m in (*FITS, *NETWORKS, RESTORED)
+                }
                 for count in (10, 96, 4, 20)
             },
             "cnn-ps": {"cnn-ps": partial(self.lights, "cnn-ps", 10)},
             "synth": {name: partial(self.synth_errors, name) for name in SYNTH},
             "noise": {m: partial(self.noise, m) for m in (*FITS, *NETWORKS)},
-            "eight-bits": {name: partial(self.eight_bits, convert, name) for name, convert in bits.items()},
-            "optics": {name: partial(self.optics, camera, name) for name, camera in cameras.items()},
+            "eight-bits": {
+                name: partial(self.eight_bits, convert, name) for name, convert in bits.items()
+            },
+            "optics": {
+                name: partial(self.optics, camera, name) for name, camera in cameras.items()
+            },
             "slants": {label: partial(self.slants, label) for label in OBJECTS},
             "photographs": {name: partial(self.photographs, name) for name in captures},
             "confidence": {name: partial(self.confidence, name) for name in captures},
@@ -286,7 +367,9 @@ def each(measure: Callable[[], dict[str, Cells]], names: Sequence[str]) -> Rows:
     return {name: lambda name=name: once()[name] for name in names}  # type: ignore[misc]
 
 
-def means(results: Sequence[Mapping[str, Any]], column: Callable[[Mapping[str, Any]], str]) -> Cells:
+def means(
+    results: Sequence[Mapping[str, Any]], column: Callable[[Mapping[str, Any]], str]
+) -> Cells:
     """Return the mean error over the captures of each column."""
     values: dict[str, list[float]] = {}
     for result in results:
@@ -304,10 +387,14 @@ def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
         shutil.copytree(folder, draft, dirs_exist_ok=True)
         named = folder / "filenames.txt"
         images = (
-            [folder / name for name in named.read_text("utf-8").split()] if named.exists() else folder.glob("0*.png")
+            [folder / name for name in named.read_text("utf-8").split()]
+            if named.exists()
+            else folder.glob("0*.png")
         )
         for path in images:
-            cv2.imwrite(str(draft / path.name), convert(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+            cv2.imwrite(
+                str(draft / path.name), convert(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            )
         draft.rename(copy)
     return copy
 
@@ -327,16 +414,22 @@ def mosaic(image: Any) -> Any:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--results", type=Path, default=tables.ROOT / "runs/figures")
     parser.add_argument("--figures", type=Path, default=tables.FIGURES)
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--only", nargs="+", default=[])
     parser.add_argument("--again", action="store_true", help="measure rows again that are done")
-    parser.add_argument("--machine", default="unnamed machine", help="as in 'two cores of an AMD EPYC'")
+    parser.add_argument(
+        "--machine", default="unnamed machine", help="as in 'two cores of an AMD EPYC'"
+    )
     options = parser.parse_args(arguments)
-    measured: Measured = json.loads(options.figures.read_text("utf-8")) if options.figures.exists() else {}
+    measured: Measured = (
+        json.loads(options.figures.read_text("utf-8")) if options.figures.exists() else {}
+    )
     measurements = Bench(options.data, options.results, options.trials).measurements()
     weights = tables.shipped_weights()
     for chosen in options.only or [name for name in measurements if name not in NEED_QUIET]:
@@ -348,7 +441,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             kept = {} if options.again else stored.get("rows", {})
             stored = {"rows": {row: cells for row, cells in kept.items() if row in FITS}}
         machine = options.machine if name in NEED_QUIET else ""
-        measured[name] = {"version": __version__, "weights": used, "machine": machine, "rows": {}, **stored}
+        measured[name] = {
+            "version": __version__,
+            "weights": used,
+            "machine": machine,
+            "rows": {},
+            **stored,
+        }
         for row, measure in measurements[name].items():
             if row in measured[name]["rows"] or wanted not in ("", row):
                 continue

@@ -1,14 +1,15 @@
-"""Measure the network on a quiet machine and beside busy processes, with and without sleeping threads.
+"""Measure the network on a quiet machine and beside busy processes, with and without sleeping
+threads.
 
 python benchmarks/busy_machine.py [CAPTURE] [--busy N] [--pixels N] [--repeats 3]
 
-PyTorch's threads wait for each other after each step. By default, a waiting thread keeps its core busy for a while. If
-other processes need the core, the thread that the others wait for gets no time. With OMP_WAIT_POLICY=passive, waiting
-threads sleep; the `splinecli` command sets this itself.
+PyTorch's threads wait for each other after each step. By default, a waiting thread keeps its core
+busy for a while. If other processes need the core, the thread that the others wait for gets no
+time. With OMP_WAIT_POLICY=passive, waiting threads sleep; the `splinecli` command sets this itself.
 
-Each figure is the median time of one estimate by spline-net, in seconds, in a process of its own. The settings take
-turns, so that all of them meet the same conditions. CAPTURE is examples/medallion by default, and --busy the number of
-cores; --busy 0 measures the quiet machine alone.
+Each figure is the median time of one estimate by spline-net, in seconds, in a process of its own.
+The settings take turns, so that all of them meet the same conditions. CAPTURE is examples/medallion
+by default, and --busy the number of cores; --busy 0 measures the quiet machine alone.
 """
 
 import argparse
@@ -47,7 +48,9 @@ print(time.perf_counter() - started)
 
 def seconds(capture: Path, pixels: int, variables: dict[str, str]) -> float:
     """Return the time of one estimate in a new process with these environment variables."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    inherited = {
+        name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))
+    }
     done = subprocess.run(
         [sys.executable, "-c", _TIMED, str(capture), str(pixels)],
         env={**inherited, **variables},
@@ -71,7 +74,9 @@ def busy_processes(count: int) -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", nargs="?", type=Path, default=MEDALLION)
     parser.add_argument("--busy", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--pixels", type=int, default=10**9)

@@ -2,9 +2,10 @@
 
     python benchmarks/capture_faults.py [CAPTURE...] [--scenes 72] [--draws 5] [--fit]
 
-Renders scenes of all kinds of shapes in all classes of materials, under distant lights and under lamps at 2 to 6 widths
-of the object, and draws 8 to 40 lights. Prints for each fault the shares of captures that get each warning. Of real
-captures, draws of 10 and 20 lights and all lights are checked as they are.
+Renders scenes of all kinds of shapes in all classes of materials, under distant lights and under
+lamps at 2 to 6 widths of the object, and draws 8 to 40 lights. Prints for each fault the shares of
+captures that get each warning. Of real captures, draws of 10 and 20 lights and all lights are
+checked as they are.
 """
 
 import argparse
@@ -29,7 +30,12 @@ from splinecli.lights.draws import draw_lights
 from splinecli.maths.transfer import encode_srgb
 from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_direct, render_indirect
+from splinecli.workshop.synthesis.scenes import (
+    SceneConfig,
+    draw_scene,
+    render_direct,
+    render_indirect,
+)
 
 Array = NDArray[np.float64]
 WIDTHS = (2.0, 3.0, 4.0, 6.0)
@@ -55,11 +61,17 @@ def render(index: int) -> Iterator[Rendered]:
     shape = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")[index % 12]
     mesh = sphere(count=150) if shape == "sphere" else None
     if shape and mesh is None:
-        steepness = {"relief": rng.uniform(0.5, 1.2), "plane": 0.0, "low relief": rng.uniform(0.05, 0.4)}[shape]
+        steepness = {
+            "relief": rng.uniform(0.5, 1.2),
+            "plane": 0.0,
+            "low relief": rng.uniform(0.05, 0.4),
+        }[shape]
         field = height_field("relief", 201)
         normals = field.vertex_normals / field.vertex_normals[:, 2:] * (steepness, steepness, 1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        mesh = Mesh(field.vertices * np.float32((1, 1, steepness)), field.faces, normals.astype(np.float32))
+        mesh = Mesh(
+            field.vertices * np.float32((1, 1, steepness)), field.faces, normals.astype(np.float32)
+        )
     config = SceneConfig(size=SIZE, lights=4)
     scene = draw_scene(SEED, index, config, mesh)
     z, azimuth = rng.uniform(0.5, 0.99, N_LIGHTS), rng.uniform(0, 2 * np.pi, N_LIGHTS)
@@ -77,16 +89,25 @@ def render(index: int) -> Iterator[Rendered]:
         near = render_point_lights(tracer, visible, positions + middle, *surface)
         generator = torch.Generator().manual_seed(index)
         indirect = render_indirect(
-            tracer, visible, lights.astype(np.float32), *surface,
-            directions=32, bounces=2, generator=generator,
-        )  # fmt: skip
+            tracer,
+            visible,
+            lights.astype(np.float32),
+            *surface,
+            directions=32,
+            bounces=2,
+            generator=generator,
+        )
     for kind, bounced in indirect.items():
         images = (distant[kind] + bounced).numpy(), near[kind].numpy() / unit + bounced.numpy()
         yield Rendered(kind, shape or scene.shape, visible.mask, lights, *images, widths)
 
 
-def codes(observations: Array, mask: NDArray[np.bool_], lights: Array, *, measured: bool = True) -> list[str]:
-    capture = Capture("rendered", observations.astype(np.float32), lights, tuple(range(len(lights))), mask)
+def codes(
+    observations: Array, mask: NDArray[np.bool_], lights: Array, *, measured: bool = True
+) -> list[str]:
+    capture = Capture(
+        "rendered", observations.astype(np.float32), lights, tuple(range(len(lights))), mask
+    )
     intensities = np.ones(len(lights)) if measured else None
     found = [warning.code for warning in check_arrays(capture, intensities=intensities)]
     if not measured and estimate_light_intensities(capture.observations, None, lights) is not None:
@@ -117,12 +138,19 @@ def faults(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, lis
     inner = picture[SIZE // 2 : 3 * SIZE // 2, SIZE // 2 : 3 * SIZE // 2]
     inner[mask] = right
     everything = np.ones(picture.shape[:2], np.bool_)
-    yield "x negated, no mask", codes(picture.reshape(-1, len(lights)), everything, lights * (-1, 1, 1))
+    yield (
+        "x negated, no mask",
+        codes(picture.reshape(-1, len(lights)), everything, lights * (-1, 1, 1)),
+    )
 
 
 KINDS: dict[str, Kind | None] = {
-    "right": None, "encoded": "curve", "near": "near", "constant": "offset", "unequal": "intensities",
-}  # fmt: skip
+    "right": None,
+    "encoded": "curve",
+    "near": "near",
+    "constant": "offset",
+    "unequal": "intensities",
+}
 """Captures that the readings are fitted to, and the reading that is right."""
 
 PRIOR = {"right": 0.7, "encoded": 0.12, "near": 0.06, "constant": 0.06, "unequal": 0.06}
@@ -131,38 +159,64 @@ PRIOR = {"right": 0.7, "encoded": 0.12, "near": 0.06, "constant": 0.06, "unequal
 def readings_of(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, list[Reading]]]:
     """Yield the readings of a scene as it is and with each fault of KINDS."""
     chosen = rng.choice(N_LIGHTS, int(rng.choice((8, 10, 12, 16))), replace=False)
-    right, near = (images[:, chosen] / np.quantile(images, 0.999) for images in (scene.distant, scene.near))
-    share = rng.choice((0.1, 0.3, 0.8)) * right.mean(axis=1, keepdims=True) / scene.lights[:, 2].mean()
+    right, near = (
+        images[:, chosen] / np.quantile(images, 0.999) for images in (scene.distant, scene.near)
+    )
+    share = (
+        rng.choice((0.1, 0.3, 0.8)) * right.mean(axis=1, keepdims=True) / scene.lights[:, 2].mean()
+    )
     unequal = right * np.exp(rng.normal(0, 0.3, len(chosen)))
-    made = {"right": right, "encoded": right, "near": near, "constant": right + share, "unequal": unequal}
+    made = {
+        "right": right,
+        "encoded": right,
+        "near": near,
+        "constant": right + share,
+        "unequal": unequal,
+    }
     for kind, images in made.items():
-        images = (images / np.quantile(images, 0.999) + rng.normal(0, NOISE, images.shape)).clip(0, 1)
+        images = (images / np.quantile(images, 0.999) + rng.normal(0, NOISE, images.shape)).clip(
+            0, 1
+        )
         values = encode_srgb(images) / 255.0 if kind == "encoded" else images
         yield kind, Readings(Sample(values, scene.mask, 1), scene.lights[chosen]).fit(ALL_KINDS)
 
 
 def fit(found: Sequence[tuple[str, list[Reading]]]) -> None:
     """Print the costs and powers with which the readings of captures are likeliest right."""
-    cases = [(kind, {each.kind: each for each in reversed(readings)}) for kind, readings in found if readings]
+    cases = [
+        (kind, {each.kind: each for each in reversed(readings)})
+        for kind, readings in found
+        if readings
+    ]
     logs = np.array([[np.log(each[kind].ratio) for kind in ALL_KINDS] for _, each in cases])
     # What the evidence holds beside cost and power, such as the cost of equal intensities.
     others = np.array([[each[k].evidence + COSTS[k] for k in ALL_KINDS] for _, each in cases])
     others += np.array([POWERS[kind] for kind in ALL_KINDS]) * logs
-    right = np.array([0 if KINDS[kind] is None else 1 + ALL_KINDS.index(KINDS[kind]) for kind, _ in cases])
+    right = np.array(
+        [0 if KINDS[kind] is None else 1 + ALL_KINDS.index(KINDS[kind]) for kind, _ in cases]
+    )
     counts = Counter(kind for kind, _ in cases)
     weights = np.array([PRIOR[kind] / counts[kind] for kind, _ in cases])
 
     def loss(values: Array) -> float:
         costs, powers = values[: len(ALL_KINDS)], np.exp(values[len(ALL_KINDS) :])
-        evidence = np.concatenate((np.zeros((len(logs), 1)), others - costs - powers * logs), axis=1)
+        evidence = np.concatenate(
+            (np.zeros((len(logs), 1)), others - costs - powers * logs), axis=1
+        )
         surprise = np.logaddexp.reduce(evidence, axis=1) - evidence[np.arange(len(right)), right]
         return float((weights * surprise).sum())
 
     start = [*(COSTS[kind] for kind in ALL_KINDS), *(np.log(POWERS[kind]) for kind in ALL_KINDS)]
     best = minimize(loss, start, method="BFGS")
-    print(f"loss {loss(np.array(start)):.3f} as it is, {best.fun:.3f} at best, of {len(cases)} captures")
+    print(
+        f"loss {loss(np.array(start)):.3f} as it is, {best.fun:.3f} at best, of {len(cases)}"
+        " captures"
+    )
     for place, kind in enumerate(ALL_KINDS):
-        print(f"{kind:12} cost {best.x[place]:.2f}, power {np.exp(best.x[len(ALL_KINDS) + place]):.2f}")
+        print(
+            f"{kind:12} cost {best.x[place]:.2f}, power"
+            f" {np.exp(best.x[len(ALL_KINDS) + place]):.2f}"
+        )
 
 
 def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
@@ -173,11 +227,16 @@ def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
         name = f"{folder.parent.name}/{folder.name}, {count or source.n_lights} lights"
         for draw in draw_lights(source.light_directions, count, trials=draws, seed=SEED):
             capture = source.read(draw)
-            yield name, [warning.code for warning in (*capture.warnings, *check_capture(source, capture))]
+            yield (
+                name,
+                [warning.code for warning in (*capture.warnings, *check_capture(source, capture))],
+            )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=72)
     parser.add_argument("--draws", type=int, default=5)
@@ -186,14 +245,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     if options.fit:
         rngs = ((index, np.random.default_rng([SEED, index, 2])) for index in range(options.scenes))
-        fit([case for index, rng in rngs for scene in render(index) for case in readings_of(scene, rng)])
+        fit(
+            [
+                case
+                for index, rng in rngs
+                for scene in render(index)
+                for case in readings_of(scene, rng)
+            ]
+        )
         return
     total: Counter[tuple[str, str]] = Counter()
     named: dict[tuple[str, str], Counter[str]] = {}
-    rows = [(kind, "real", found) for folder in options.captures for kind, found in real(folder, options.draws)]
+    rows = [
+        (kind, "real", found)
+        for folder in options.captures
+        for kind, found in real(folder, options.draws)
+    ]
     for index in range(options.scenes):
         rng = np.random.default_rng([SEED, index, 1])
-        rows += [(kind, scene.kind, found) for scene in render(index) for kind, found in faults(scene, rng)]
+        rows += [
+            (kind, scene.kind, found)
+            for scene in render(index)
+            for kind, found in faults(scene, rng)
+        ]
     for fault, kind, found in rows:
         total[fault, kind] += 1
         named.setdefault((fault, kind), Counter()).update(set(found))

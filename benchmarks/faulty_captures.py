@@ -1,12 +1,14 @@
-"""Render captures, right and faulty ones, and estimate them: examples for benchmarks/fit_capture_confidence.py.
+"""Render captures, right and faulty ones, and estimate them: examples for
+benchmarks/fit_capture_confidence.py.
 
-    python benchmarks/faulty_captures.py FOLDER [--scenes 1020] [--size 64] [--part 1/2] [--sets SET ...]
+    python benchmarks/faulty_captures.py FOLDER [--scenes 1020] [--size 64] [--part 1/2] [--sets SET
+    ...]
 
-Half of the scenes are rendered here; the others are whole scenes of pixel sets of `splinecli prepare`, which have more
-pixels and more detail. Without --sets, all are rendered here. Each scene becomes three captures of KINDS: right ones,
-and ones whose lamps or files are not what they are taken for. spline-net estimates them. FOLDER keeps each with its
-true errors in a file. A run continues an earlier one; --part I/N takes every N-th scene, so that N processes can share
-the work.
+Half of the scenes are rendered here; the others are whole scenes of pixel sets of `splinecli
+prepare`, which have more pixels and more detail. Without --sets, all are rendered here. Each scene
+becomes three captures of KINDS: right ones, and ones whose lamps or files are not what they are
+taken for. spline-net estimates them. FOLDER keeps each with its true errors in a file. A run
+continues an earlier one; --part I/N takes every N-th scene, so that N processes can share the work.
 """
 
 import argparse
@@ -64,9 +66,16 @@ def draw_mesh(rng: np.random.Generator) -> Mesh:
         return draw_shape(rng)[1]
     count = 200
     if kind < 0.7:
-        polar, azimuth = np.meshgrid(np.linspace(0.01, np.pi - 0.01, count), np.linspace(0, 2 * np.pi, count))
-        axes = rng.uniform(0.5, 0.95, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.5, 0.95))
-        sphere = np.stack((np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), axis=-1)
+        polar, azimuth = np.meshgrid(
+            np.linspace(0.01, np.pi - 0.01, count), np.linspace(0, 2 * np.pi, count)
+        )
+        axes = (
+            rng.uniform(0.5, 0.95, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.5, 0.95))
+        )
+        sphere = np.stack(
+            (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)),
+            axis=-1,
+        )
         vertices, normals = sphere * axes, unit(sphere / axes)
     else:
         x, y = np.meshgrid(*[np.linspace(-1.05, 1.05, count)] * 2)
@@ -77,12 +86,20 @@ def draw_mesh(rng: np.random.Generator) -> Mesh:
             wave = way[0] * x + way[1] * y + rng.uniform(0, 6.3)
             heights += steepness / np.linalg.norm(way) * np.sin(wave)
             slopes += steepness / np.linalg.norm(way) * np.cos(wave) * way[:, None, None]
-        vertices, normals = np.stack((x, y, heights), -1), unit(np.stack((*-slopes, np.ones_like(x)), -1))
+        vertices, normals = (
+            np.stack((x, y, heights), -1),
+            unit(np.stack((*-slopes, np.ones_like(x)), -1)),
+        )
     corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     first = np.stack((corner, corner + 1, corner + count), axis=1)
-    faces = np.concatenate((first, np.stack((corner + 1, corner + count + 1, corner + count), axis=1)))
+    faces = np.concatenate(
+        (first, np.stack((corner + 1, corner + count + 1, corner + count), axis=1))
+    )
     mesh = Mesh(
-        *(values.reshape(-1, 3).astype(kept) for values, kept in ((vertices, "f4"), (faces, "i4"), (normals, "f4")))
+        *(
+            values.reshape(-1, 3).astype(kept)
+            for values, kept in ((vertices, "f4"), (faces, "i4"), (normals, "f4"))
+        )
     )
     return turn(mesh, draw_rotation(rng)) if kind < 0.7 else mesh
 
@@ -110,7 +127,9 @@ def draw_lights(rng: np.random.Generator) -> Floats:
 
 
 def disturb_lights(lights: Floats, rng: np.random.Generator) -> Floats:
-    """Return directions (F, 3) as a wrong file gives them: turned, noisy, negated, or in a wrong order."""
+    """Return directions (F, 3) as a wrong file gives them: turned, noisy, negated, or in a wrong
+    order.
+    """
     kind, count = rng.integers(8), len(lights)
     x, y, z = lights.T
     if kind == 0:
@@ -134,7 +153,9 @@ def disturb_lights(lights: Floats, rng: np.random.Generator) -> Floats:
 
 
 def bend_values(values: Floats, rng: np.random.Generator) -> Floats:
-    """Return linear values, about 0 to 1, as a wrong curve gives them: encoded, or decoded a second time."""
+    """Return linear values, about 0 to 1, as a wrong curve gives them: encoded, or decoded a second
+    time.
+    """
     if rng.random() < 0.5:
         values = values / np.quantile(values, 0.999)  # well exposed
     values = values.clip(0, 1)
@@ -156,7 +177,11 @@ class Scene(NamedTuple):
 
 
 def render_scenes(
-    index: int, size: int, kinds: Sequence[str], rng: np.random.Generator, generator: torch.Generator
+    index: int,
+    size: int,
+    kinds: Sequence[str],
+    rng: np.random.Generator,
+    generator: torch.Generator,
 ) -> list[Scene]:
     """Render one shape for captures of these kinds, with its own material and lights for each."""
     size = round(size * rng.uniform(0.8, 1.2) / 8) * 8
@@ -175,7 +200,8 @@ def render_scenes(
         single = lights.astype(np.float32)
         lamps = None
         if kind == "near lamps" or (kind == "right" and rng.random() < 0.1):
-            # Widths of the object from its mean plane. All lamps are equally strong, or measured at the origin.
+            # Widths of the object from its mean plane. All lamps are equally strong, or measured at
+            # the origin.
             middle = np.array((0, 0, visible.samples.position[:, 2].mean()))
             positions = lights * 2 * 1.5 * 6.7 ** rng.random()
             radiance = render_point_lights(tracer, visible, positions + middle, *parts)["one"]
@@ -187,12 +213,16 @@ def render_scenes(
         if rng.random() < 0.65:
             more = {"directions": 48, "bounces": 3, "generator": generator}
             with torch.inference_mode():
-                radiance = radiance + render_indirect(tracer, visible, single, *parts, **more)["one"]
+                radiance = (
+                    radiance + render_indirect(tracer, visible, single, *parts, **more)["one"]
+                )
         made.append(Scene(radiance, visible.mask, visible.normals, lights, index, lamps))
     return made
 
 
-def stored_scene(pixel_set: PixelSet, rng: np.random.Generator, generator: torch.Generator) -> Scene:
+def stored_scene(
+    pixel_set: PixelSet, rng: np.random.Generator, generator: torch.Generator
+) -> Scene:
     """Choose a scene of a pixel set, and 5 to 60 of its lights."""
     entry = pixel_set.entries[rng.integers(len(pixel_set.entries))]
     pixels = pixel_set.load(entry)
@@ -204,23 +234,34 @@ def stored_scene(pixel_set: PixelSet, rng: np.random.Generator, generator: torch
     return Scene(radiance, np.array(pixels.mask), normals, lights, zlib.crc32(entry.scene.encode()))
 
 
-def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple[Capture, Floats, int]]:
-    """Make scene number `index` into some captures, with true normals (P, 3), zero where nothing is to be seen.
+def make_captures(
+    index: int, size: int, sets: Sequence[PixelSet]
+) -> list[tuple[Capture, Floats, int]]:
+    """Make scene number `index` into some captures, with true normals (P, 3), zero where nothing is
+    to be seen.
 
-    The last item is the number of the scene, which keeps scenes apart in the fit. Half of the scenes are of the pixel
-    sets, if there are any, and have no near lamps.
+    The last item is the number of the scene, which keeps scenes apart in the fit. Half of the
+    scenes are of the pixel sets, if there are any, and have no near lamps.
     """
-    rng, generator = np.random.default_rng([SEED, index]), torch.Generator().manual_seed(1000 * SEED + index)
-    kinds = [str(kind) for kind in rng.choice(list(KINDS), CAPTURES_PER_SCENE, p=list(KINDS.values()))]
+    rng, generator = (
+        np.random.default_rng([SEED, index]),
+        torch.Generator().manual_seed(1000 * SEED + index),
+    )
+    kinds = [
+        str(kind) for kind in rng.choice(list(KINDS), CAPTURES_PER_SCENE, p=list(KINDS.values()))
+    ]
     if sets and index % 2:
         kinds = ["right" if kind == "near lamps" else kind for kind in kinds]
         scenes = [stored_scene(sets[rng.integers(len(sets))], rng, generator) for _ in kinds]
     else:
         scenes = render_scenes(index, size, kinds, rng, generator)
     made = []
-    for kind, (radiance, mask, normals, lights, scene, lamps) in zip(kinds, scenes, strict=bool(scenes)):
+    for kind, (radiance, mask, normals, lights, scene, lamps) in zip(
+        kinds, scenes, strict=bool(scenes)
+    ):
         single = lights.astype(np.float32)
-        mask = np.pad(mask, REACH)  # a dark margin, which a lens and its inverse filter mix with the outline
+        # a dark margin, which a lens and its inverse filter mix with the outline
+        mask = np.pad(mask, REACH)
         if lamps is not None:
             lamps = lamps.within(-REACH, -REACH, 1, None)
         if kind == "no mask":
@@ -228,7 +269,11 @@ def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple
             mask = np.pad(mask, margin)
             own, normals = normals, np.zeros((mask.size, 3), np.float32)
             normals[mask.ravel()] = own
-            felt = 10 ** rng.uniform(-4, -1.5) * rng.uniform(0.5, 1.5, (mask.size, 1)) * rng.choice((0, 1))
+            felt = (
+                10 ** rng.uniform(-4, -1.5)
+                * rng.uniform(0.5, 1.5, (mask.size, 1))
+                * rng.choice((0, 1))
+            )
             shown = (felt * lights[:, 2] * float(radiance.mean())).astype(np.float32)
             shown[mask.ravel()] = radiance
             radiance, mask = torch.from_numpy(shown), np.ones_like(mask)
@@ -238,9 +283,14 @@ def make_captures(index: int, size: int, sets: Sequence[PixelSet]) -> list[tuple
         noisy = kind == "no mask" or rng.random() < 0.65
         unequal = 0.0 if kind in ("intensities", "curve") else 0.3
         config = CaptureConfig(
-            light_direction_error_share=0, light_intensity_error_share=0.2 * noisy, unequal_lights_share=unequal,
-            saturated_share=0.1, sensor_noise=noisy, eight_bit_share=0.3, optics_share=0.5,
-        )  # fmt: skip
+            light_direction_error_share=0,
+            light_intensity_error_share=0.2 * noisy,
+            unequal_lights_share=unequal,
+            saturated_share=0.1,
+            sensor_noise=noisy,
+            eight_bit_share=0.3,
+            optics_share=0.5,
+        )
         images = torch.zeros(len(lights), *mask.shape)
         images[:, torch.from_numpy(mask)] = radiance.float().T
         seen, *_ = photograph_scene(
@@ -271,18 +321,26 @@ class Recorder:
         self._refiner = refiner
         self.turns = refiner.turns
 
-    def refine(self, mask, observations, lighting_at: LightingAt, normals, errors, *, progress=None) -> None:  # type: ignore[no-untyped-def]
+    def refine(
+        self, mask, observations, lighting_at: LightingAt, normals, errors, *, progress=None
+    ) -> None:  # type: ignore[no-untyped-def]
         light = lighting_at(np.arange(len(normals)))
         self.before = normals.copy(), errors.copy()
         self._refiner.refine(mask, observations, lighting_at, normals, errors, progress=progress)
         self.seen = {
-            "observations": light.observations, "directions": light.directions, "mask": mask,
-            "normals": normals.copy(), "errors": errors.copy(),
-            "pixelwise_normals": self.before[0], "pixelwise_errors": self.before[1],
-        }  # fmt: skip
+            "observations": light.observations,
+            "directions": light.directions,
+            "mask": mask,
+            "normals": normals.copy(),
+            "errors": errors.copy(),
+            "pixelwise_normals": self.before[0],
+            "pixelwise_errors": self.before[1],
+        }
 
 
-def store_captures(folder: Path, scenes: Sequence[int], size: int, sets: Sequence[PixelSet]) -> None:
+def store_captures(
+    folder: Path, scenes: Sequence[int], size: int, sets: Sequence[PixelSet]
+) -> None:
     torch.set_num_threads(1)
     estimator = make_estimator("spline-net")
     recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[assignment,arg-type]
@@ -301,15 +359,22 @@ def store_captures(folder: Path, scenes: Sequence[int], size: int, sets: Sequenc
                 for name in ("", "pixelwise_")
             }
             np.savez(
-                folder / f"{index:05d}_{number}.npz", **recorder.seen, kind=capture.name, scene=scene,
-                known=~unknown, error_deg=found[""], pixelwise_error_deg=found["pixelwise_"],
+                folder / f"{index:05d}_{number}.npz",
+                **recorder.seen,
+                kind=capture.name,
+                scene=scene,
+                known=~unknown,
+                error_deg=found[""],
+                pixelwise_error_deg=found["pixelwise_"],
                 lights=capture.light_directions,
-            )  # fmt: skip
+            )
         (folder / f"{index:05d}.done").touch()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=1020)
     parser.add_argument("--size", type=int, default=64)

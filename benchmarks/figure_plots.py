@@ -2,8 +2,8 @@
 
     python benchmarks/figure_plots.py
 
-It writes docs/pictures/accuracy_*.svg: errors against the number of lights and against the noise of the light
-directions, and beside published methods.
+It writes docs/pictures/accuracy_*.svg: errors against the number of lights and against the noise of
+the light directions, and beside published methods.
 """
 
 import json
@@ -23,14 +23,21 @@ COLOURS = {
     "spline-net-pixelwise": "#7986cb",
     "spline-net": "#1a237e",
 }
-STYLE = {"svg.hashsalt": "splinecli", "svg.fonttype": "none"}  # the same file each time, with text as text
+# the same file each time, with text as text
+STYLE = {
+    "svg.hashsalt": "splinecli",
+    "svg.fonttype": "none",
+}
 
 
 def over_lights(measured: Measured) -> Figure:
     """Return a plot of the mean error of the three objects over the number of lights."""
     cells = {count: measured[f"lights-{count}"]["rows"] for count in LIGHTS}
     means = {
-        method: [sum(cells[count][method][f"{label} {count}"] for label in OBJECTS) / len(OBJECTS) for count in LIGHTS]
+        method: [
+            sum(cells[count][method][f"{label} {count}"] for label in OBJECTS) / len(OBJECTS)
+            for count in LIGHTS
+        ]
         for method in COLOURS
     }
     figure = curves(LIGHTS, means, "number of lights")
@@ -42,7 +49,9 @@ def over_lights(measured: Measured) -> Figure:
 
 
 def over_noise(measured: Measured) -> Figure:
-    """Return a plot of the mean error of the three objects over the noise of the light directions."""
+    """Return a plot of the mean error of the three objects over the noise of the light
+    directions.
+    """
     sigmas = (0.0, *NOISE_DEG)
     rows = measured["noise"]["rows"]
     errors = {method: [rows[method][f"{sigma:g}"] for sigma in sigmas] for method in COLOURS}
@@ -50,7 +59,9 @@ def over_noise(measured: Measured) -> Figure:
 
 
 def beside_published(measured: Measured) -> Figure:
-    """Return a plot of the errors on each object under ten lights, for published methods and ours."""
+    """Return a plot of the errors on each object under ten lights,
+    for published methods and ours.
+    """
     ours = {f"{name} (ours)": measured["lights-10"]["rows"][name] for name in ("ls", "spline-net")}
     columns = [f"{label} 10" for label in OBJECTS]
     rows = {**measured[PUBLISHED]["rows"], **ours}
@@ -59,7 +70,11 @@ def beside_published(measured: Measured) -> Figure:
     axes = figure.axes[0]
     width = 0.8 / len(rows)
     for k, (name, cells) in enumerate(rows.items()):
-        colour = COLOURS["spline-net"] if name == "spline-net (ours)" else str(0.85 - 0.5 * k / len(rows))
+        colour = (
+            COLOURS["spline-net"]
+            if name == "spline-net (ours)"
+            else str(0.85 - 0.5 * k / len(rows))
+        )
         places = [x + (k - (len(rows) - 1) / 2) * width for x in range(len(columns))]
         axes.bar(places, [cells[column] for column in columns], width, color=colour, label=name)
     axes.set_xticks(range(len(columns)), list(OBJECTS))

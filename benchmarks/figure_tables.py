@@ -2,8 +2,8 @@
 
     python benchmarks/figure_tables.py
 
-A table stands between `<!-- figures: NAME -->` and `<!-- end -->`; TABLES says what it shows. Below it stand the
-version and the weights that it was measured with. all_figures.py measures.
+A table stands between `<!-- figures: NAME -->` and `<!-- end -->`; TABLES says what it shows. Below
+it stand the version and the weights that it was measured with. all_figures.py measures.
 """
 
 import json
@@ -18,12 +18,15 @@ FIGURES = ROOT / "docs/figures.json"
 PAGES = ("README.md", "docs/measurements.md", "docs/robustness.md")
 
 Measured = dict[str, dict[str, Any]]
-"""By name of the measurement: {"version", "weights", "machine", "rows": {row: {column: number or text}}}."""
+"""By name of the measurement: {"version", "weights", "machine", "rows": {row: {column: number or
+text}}}.
+"""
 
 FITS = ("ls", "ls-trimmed", "l1", "iw12", "st14", "ia14")
 NETWORKS = ("spline-net-pixelwise", "spline-net")
 RESTORED = "spline-net, restored"
-"""The default method on images as `infer` reads them. In the other rows, they are read as stored."""
+"""The default method on images as `infer` reads them. In the other rows, they are read as stored.
+"""
 OBJECTS = {"Ball": "ballPNG", "Cat": "catPNG", "Reading": "readingPNG"}
 STATUES = {
     "bust_diffuse": "bust, matte and glossy",
@@ -39,19 +42,33 @@ SLANTS = {"below 60 degrees": (0, 60), "60 to 75 degrees": (60, 75), "above 75 d
 SYNTH = [f"{shape} {material}" for shape in ("sphere", "relief", "bowl") for material in "SM"]
 PUBLISHED = "published"
 """Figures of papers, for ten lights."""
-SCENES = [f"{look} {shape}" for shape in ("sphere", "relief", "plane") for look in ("matte", "glossy")]
+SCENES = [
+    f"{look} {shape}" for shape in ("sphere", "relief", "plane") for look in ("matte", "glossy")
+]
 LIGHTS = (4, 10, 20, 96)
 NOISE_DEG = (2.0, 4.0, 8.0)
 MIRROR_BALLS = ("University of Washington", "PSBox, mean of two", "examples/mirror_ball")
 WRONG_FILES = (
-    "right", "x negated", "y negated", "x and y exchanged", "turned by 90 degrees", "x and y negated",
-    "shifted by one", "reversed", "shuffled", "two exchanged",
-)  # fmt: skip
+    "right",
+    "x negated",
+    "y negated",
+    "x and y exchanged",
+    "turned by 90 degrees",
+    "x and y negated",
+    "shifted by one",
+    "reversed",
+    "shuffled",
+    "two exchanged",
+)
 LIGHT_FILE_CAPTURES = ("photographs", "diffuse, specular", "metal")
 EXPOSED = ("well exposed", "as stored", "left out", "restored")
 INTENSITIES = ("measured", "equal", "estimated")
 PICTURES = {"material": "material", "Lambertian": "lambertian", "nearest photograph": "nearest"}
-SPEEDS = ("layers of the paper, float32", "spline-net-pixelwise, float32", "spline-net-pixelwise, bfloat16")
+SPEEDS = (
+    "layers of the paper, float32",
+    "spline-net-pixelwise, float32",
+    "spline-net-pixelwise, bfloat16",
+)
 SIZES = ("0.5", "2", "6", "24")
 
 
@@ -80,19 +97,28 @@ class Table:
                 known.setdefault(row, {}).update(cells)
         if not known.keys() & set(self.rows.values()):
             return "(not measured with these weights)"
-        lines = ["| " + " | ".join((self.head, *self.columns)) + " |", "|---|" + "---:|" * len(self.columns)]
+        lines = [
+            "| " + " | ".join((self.head, *self.columns)) + " |",
+            "|---|" + "---:|" * len(self.columns),
+        ]
         for label, row in self.rows.items():
             if row not in known:
                 continue  # not measured at all
             values = [known[row].get(column, "-") for column in self.columns.values()]
-            shown = (value if isinstance(value, str) else self.form.format(value) for value in values)
+            shown = (
+                value if isinstance(value, str) else self.form.format(value) for value in values
+            )
             lines.append("| " + " | ".join((label, *shown)) + " |")
-        captions = dict.fromkeys(caption(measured[source], weights) for source in sources if source != PUBLISHED)
+        captions = dict.fromkeys(
+            caption(measured[source], weights) for source in sources if source != PUBLISHED
+        )
         return "\n".join(lines) + f"\n\n{' '.join(captions)}"
 
 
 def caption(measurement: Mapping[str, Any], weights: str) -> str:
-    """Return which version, weights and machine a measurement is of. Other weights than the shipped are marked."""
+    """Return which version, weights and machine a measurement is of. Other weights than the shipped
+    are marked.
+    """
     used = measurement["weights"]
     parts = [f"version {measurement['version']}"]
     parts += [f"weights {used}"] if used else []
@@ -153,7 +179,11 @@ TABLES = {
         ("eight-bits",),
         "images",
         same(("16 bits", "rounded to 8 bits", "cut to 8 bits")),
-        {f"{label}, {name}": f"{label} {name}" for label in OBJECTS for name in ("pixelwise", "refined")},
+        {
+            f"{label}, {name}": f"{label} {name}"
+            for label in OBJECTS
+            for name in ("pixelwise", "refined")
+        },
     ),
     "optics": Table(
         ("optics",),
@@ -182,14 +212,18 @@ TABLES = {
         same(("expected", "found", "worst tenth")),
         "{:.0f} %",
     ),
-    "wrong-lights": Table(("wrong-lights",), "light file", same(WRONG_FILES), same(LIGHT_FILE_CAPTURES)),
+    "wrong-lights": Table(
+        ("wrong-lights",), "light file", same(WRONG_FILES), same(LIGHT_FILE_CAPTURES)
+    ),
     "near-lamps": Table(
         ("near-lamps",),
         "object",
         same(SCENES),
         same(("distant", *(f"{width}: {how}" for width in (2, 4, 8) for how in ("no", "yes")))),
     ),
-    "calibration": Table(("calibration",), "ball", same(MIRROR_BALLS), same(("mean", "largest")), "{:.1f}"),
+    "calibration": Table(
+        ("calibration",), "ball", same(MIRROR_BALLS), same(("mean", "largest")), "{:.1f}"
+    ),
     "relighting": Table(("relighting",), "object", same(OBJECTS), PICTURES, "{:.1f}"),
     "distilled": Table(("distilled",), "object", same(OBJECTS), same(("network", "distilled"))),
     "speed": Table(("speed",), "network", same(SPEEDS), same(("pixels/s", "relative")), "{:,.0f}"),

@@ -2,10 +2,11 @@
 
     python benchmarks/fit_capture_confidence.py FOLDER [--write]
 
-FOLDER is that of benchmarks/faulty_captures.py. Prints, by kind of capture: the share of normals within 5 degrees that
-is claimed before and after the correction, and the true one; the mean differences of a capture's claim from its truth;
-and the share of the worst tenth that the least confident tenth holds, before and after. Scenes were not seen by the fit
-that they are judged with. --write fits to all scenes, and puts the result into the package.
+FOLDER is that of benchmarks/faulty_captures.py. Prints, by kind of capture: the share of normals
+within 5 degrees that is claimed before and after the correction, and the true one; the mean
+differences of a capture's claim from its truth; and the share of the worst tenth that the least
+confident tenth holds, before and after. Scenes were not seen by the fit that they are judged with.
+--write fits to all scenes, and puts the result into the package.
 """
 
 import argparse
@@ -21,7 +22,11 @@ from torch import Tensor
 
 from splinecli.estimate.confidence import capture_features
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
-from splinecli.estimate.networks.li_ne_net import CaptureHead, error_negative_log_likelihood, probability_within
+from splinecli.estimate.networks.li_ne_net import (
+    CaptureHead,
+    error_negative_log_likelihood,
+    probability_within,
+)
 from splinecli.estimate.networks.weights import HEAD_FORMAT, manifest
 from splinecli.lights.lighting import PixelIndices, PixelLighting, PixelPlaces
 from splinecli.system.files import file_sha256
@@ -34,14 +39,20 @@ HEADS, HIDDEN = 8, 6
 """The mean of so many heads, of so many hidden units each, is one head of all their units."""
 
 FEATURE_NOISE = 0.2
-"""Standard deviation of the noise on the features of captures in the fit, in their spread. It keeps the fit smooth."""
+"""Standard deviation of the noise on the features of captures in the fit, in their spread. It keeps
+the fit smooth.
+"""
 
 WEIGHTS = {"right": 2.0, "near lamps": 2.0}
-"""Weights of captures in the fit, otherwise 1. Most captures are right; scenes of pixel sets have no near lamps."""
+"""Weights of captures in the fit, otherwise 1. Most captures are right; scenes of pixel sets have
+no near lamps.
+"""
 
 
 class Example(NamedTuple):
-    """What the fit needs of some pixels of an estimated capture: see CaptureHead.forward. errors_deg: true."""
+    """What the fit needs of some pixels of an estimated capture: see CaptureHead.forward.
+    errors_deg: true.
+    """
 
     kind: str
     scene: int
@@ -60,7 +71,9 @@ def read_examples(folder: Path) -> Iterator[Example]:
         lit = np.flatnonzero(observations.max(axis=1) > 0)
         rows = rng.choice(lit, min(len(lit), PIXELS), replace=False)
 
-        def lighting_at(rows: PixelIndices, seen: Floats = observations, lights: Floats = directions) -> PixelLighting:
+        def lighting_at(
+            rows: PixelIndices, seen: Floats = observations, lights: Floats = directions
+        ) -> PixelLighting:
             return PixelLighting(seen[rows], lights if lights.ndim == 2 else lights[rows])
 
         for name in ("", "pixelwise_"):
@@ -71,10 +84,13 @@ def read_examples(folder: Path) -> Iterator[Example]:
             places = PixelPlaces(mask).places(rows)
             pixels = features[1].features(observations[rows].mean(axis=1), normals[rows], *places)
             yield Example(
-                f"{found['kind']}{', pixelwise' if name else ''}", int(found["scene"]), torch.from_numpy(errors[rows]),
-                torch.from_numpy(pixels).float(), torch.tensor(features[0]).float(),
+                f"{found['kind']}{', pixelwise' if name else ''}",
+                int(found["scene"]),
+                torch.from_numpy(errors[rows]),
+                torch.from_numpy(pixels).float(),
+                torch.tensor(features[0]).float(),
                 torch.from_numpy(found[f"{name}error_deg"][rows]),
-            )  # fmt: skip
+            )
 
 
 def fit_head(examples: Sequence[Example]) -> CaptureHead:
@@ -99,7 +115,8 @@ def fit_one(examples: Sequence[Example], seed: int) -> CaptureHead:
     head = CaptureHead(HIDDEN)
     number = torch.cat([torch.full((len(e.errors),), place) for place, e in enumerate(examples)])
     errors, pixels, errors_deg = (
-        torch.cat([getattr(e, name) for e in examples]) for name in ("errors", "pixels", "errors_deg")
+        torch.cat([getattr(e, name) for e in examples])
+        for name in ("errors", "pixels", "errors_deg")
     )
     captures = torch.stack([e.capture for e in examples])
     weights = torch.tensor([WEIGHTS.get(e.kind.partition(",")[0], 1.0) for e in examples])[number]
@@ -126,7 +143,9 @@ def fit_one(examples: Sequence[Example], seed: int) -> CaptureHead:
 
 
 def print_table(examples: Sequence[Example]) -> None:
-    """Print what is claimed of scenes that the fit did not see, as five fits to four fifths of them give it."""
+    """Print what is claimed of scenes that the fit did not see, as five fits to four fifths of them
+    give it.
+    """
     rows: dict[str, list[list[float]]] = {}
     for fold in range(5):
         head = fit_head([e for e in examples if e.scene % 5 != fold])
@@ -135,14 +154,25 @@ def print_table(examples: Sequence[Example]) -> None:
             before, after = (probability_within(claim, CONFIDENT_DEG).numpy() for claim in claims)
             true = float((e.errors_deg <= CONFIDENT_DEG).float().mean())
             worst = np.argsort(-e.errors_deg.numpy())[: len(before) // 10]
-            ranks = [float(np.isin(worst, np.argsort(claim)[: len(worst)]).mean()) for claim in (before, after)]
-            rows.setdefault(e.kind, []).append([float(before.mean()), float(after.mean()), true, *ranks])
-    print("| capture | number | claimed before | after | true | off before | after | worst tenth before | after |")
+            ranks = [
+                float(np.isin(worst, np.argsort(claim)[: len(worst)]).mean())
+                for claim in (before, after)
+            ]
+            rows.setdefault(e.kind, []).append(
+                [float(before.mean()), float(after.mean()), true, *ranks]
+            )
+    print(
+        "| capture | number | claimed before | after | true | off before | after | worst tenth"
+        " before | after |"
+    )
     print("|---|" + "---:|" * 8)
     for kind, found in sorted(rows.items()):
         before, after, true, *ranks = np.array(found).T
         columns = [before, after, true, np.abs(before - true), np.abs(after - true), *ranks]
-        print(f"| {kind} | {len(found)} |" + "".join(f" {100 * column.mean():.0f} % |" for column in columns))
+        print(
+            f"| {kind} | {len(found)} |"
+            + "".join(f" {100 * column.mean():.0f} % |" for column in columns)
+        )
 
 
 def write_head(head: CaptureHead) -> None:
@@ -156,7 +186,9 @@ def write_head(head: CaptureHead) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args(arguments)

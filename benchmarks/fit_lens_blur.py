@@ -1,11 +1,12 @@
-"""Fit the estimate of the lens blur to rendered captures, and print its constants for restoration/lens_blur.py.
+"""Fit the estimate of the lens blur to rendered captures, and print its constants for
+restoration/lens_blur.py.
 
     python benchmarks/fit_lens_blur.py SET ... [--captures 1600] [--seed 41]
 
-SET are pixel sets of scenes with neighbours, such as `splinecli prepare --random 80` makes. Each capture is
-photographed through its own optics (synthesis/whole_capture.py), with noise and, in a third of the captures, 8 bits.
-The wanted number is the sigma whose inverse filter brings the images closest to those without a lens; a Bayer pattern
-has one, too.
+SET are pixel sets of scenes with neighbours, such as `splinecli prepare --random 80` makes. Each
+capture is photographed through its own optics (synthesis/whole_capture.py), with noise and, in a
+third of the captures, 8 bits. The wanted number is the sigma whose inverse filter brings the images
+closest to those without a lens; a Bayer pattern has one, too.
 """
 
 import argparse
@@ -34,8 +35,12 @@ EIGHT_BIT_SHARE = 0.3
 PENALTY = 3.0  # of the squares of the coefficients
 
 
-def photograph(scene: refinement.Scene, generator: torch.Generator) -> tuple[Float32Array, Float32Array, Bools]:
-    """Return images (F, H, W), 0 to 1, of a scene through a lens, the same without it, and the object's mask (H, W)."""
+def photograph(
+    scene: refinement.Scene, generator: torch.Generator
+) -> tuple[Float32Array, Float32Array, Bools]:
+    """Return images (F, H, W), 0 to 1, of a scene through a lens, the same without it, and the
+    object's mask (H, W).
+    """
     maps, lights, mask = scene
     if draw_number(generator) < BACKGROUND_SHARE:
         maps, mask = add_background(maps, mask, lights, generator)
@@ -56,20 +61,28 @@ FILTERS = [lens_blur.inverse_filter(sigma) for sigma in SIGMAS]
 
 
 def wanted_sigma(seen: Float32Array, sharp: Float32Array, mask: Bools) -> float:
-    """Return the sigma whose inverse filter brings images closest to sharp ones at the pixels of the mask."""
+    """Return the sigma whose inverse filter brings images closest to sharp ones at the pixels of
+    the mask.
+    """
     off = np.zeros(len(SIGMAS))
     for image, true in zip(seen[:8], sharp[:8], strict=True):
-        found = [cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in FILTERS]
+        found = [
+            cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in FILTERS
+        ]
         off += [np.mean((each - true)[mask] ** 2) for each in found]
     best = int(off.argmin())
     if best in (0, len(SIGMAS) - 1):
         return float(SIGMAS[best])
     before, least, after = off[best - 1 : best + 2]
-    return float(SIGMAS[best] + (SIGMAS[1] - SIGMAS[0]) * (before - after) / (before - 2 * least + after) / 2)
+    return float(
+        SIGMAS[best] + (SIGMAS[1] - SIGMAS[0]) * (before - after) / (before - 2 * least + after) / 2
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--captures", type=int, default=1600)
     parser.add_argument("--seed", type=int, default=41)
@@ -89,14 +102,24 @@ def main() -> None:
             sigmas.append(wanted_sigma(seen, sharp, mask))
     known, wanted = np.array(numbers), np.array(sigmas)
     kept_back = np.arange(len(known)) % 4 == 0
-    for part, name in ((~kept_back, "three quarters, checked on the others"), (np.ones_like(kept_back), "all")):
+    for part, name in (
+        (~kept_back, "three quarters, checked on the others"),
+        (np.ones_like(kept_back), "all"),
+    ):
         means, deviations = known[part].mean(axis=0), known[part].std(axis=0)
         terms = lens_blur.polynomial(known, means, deviations)
         square = terms[part].T @ terms[part] + PENALTY * np.eye(terms.shape[1])
         coefficients = np.linalg.solve(square, terms[part].T @ wanted[part])
         off = (terms @ coefficients).clip(0, lens_blur.WIDEST_SIGMA) - wanted
-        print(f"fitted to {name}: error {np.sqrt((off[kept_back] ** 2).mean()):.3f} pixels (root mean square)")
-    for name, values in (("_MEANS", means), ("_DEVIATIONS", deviations), ("_COEFFICIENTS", coefficients)):
+        print(
+            f"fitted to {name}: error {np.sqrt((off[kept_back] ** 2).mean()):.3f} pixels (root"
+            " mean square)"
+        )
+    for name, values in (
+        ("_MEANS", means),
+        ("_DEVIATIONS", deviations),
+        ("_COEFFICIENTS", coefficients),
+    ):
         print(f"{name} = ({', '.join(f'{value:.4g}' for value in values)})")
 
 

@@ -1,10 +1,12 @@
-"""The steps of gpu_session.sh: a GPU against the processor, then rendering on the cores and training on the GPU.
+"""The steps of gpu_session.sh: a GPU against the processor, then rendering on the cores and
+training on the GPU.
 
 python benchmarks/gpu_session.py OUT [--data DATA] [--minutes M] [--device cuda] [--size full]
 
-Each step is a process with a limit of time, and the others go on where one fails. OUT/report.json and report.txt are
-written after each. Rendering ends after RENDERED_SHARE of the time, and training has the rest. Only the standard
-library is imported here, so the report also says what could not be installed.
+Each step is a process with a limit of time, and the others go on where one fails. OUT/report.json
+and report.txt are written after each. Rendering ends after RENDERED_SHARE of the time, and training
+has the rest. Only the standard library is imported here, so the report also says what could not be
+installed.
 """
 
 import argparse
@@ -28,7 +30,16 @@ from pathlib import Path
 from typing import Any
 
 MEDALLION = str(Path(__file__).resolve().parents[1] / "examples/medallion")
-PACKAGES = ("torch", "numpy", "opencv-python-headless", "scipy", "pyamg", "trimesh", "embreex", "distributed")
+PACKAGES = (
+    "torch",
+    "numpy",
+    "opencv-python-headless",
+    "scipy",
+    "pyamg",
+    "trimesh",
+    "embreex",
+    "distributed",
+)
 RENDERED_SHARE = 0.55
 LEAST_RENDERED_SHARE = 0.1  # of the time, for rendering after slow steps
 SPARE_SECONDS = 15  # of training, to validate and save at its end
@@ -62,12 +73,20 @@ def machine() -> Row:
     from splinecli.system.devices import choose_precision
 
     installed = {each.name: each.version for each in metadata.distributions()}
-    found: Row = {"python": platform.python_version(), **{name: installed.get(name) for name in PACKAGES}}
+    found: Row = {
+        "python": platform.python_version(),
+        **{name: installed.get(name) for name in PACKAGES},
+    }
     found["cores"] = len(os.sched_getaffinity(0))
-    found["processor"] = f"{torch.backends.cpu.get_cpu_capability()}, {choose_precision('auto', torch.device('cpu'))}"
+    found["processor"] = (
+        f"{torch.backends.cpu.get_cpu_capability()},"
+        f" {choose_precision('auto', torch.device('cpu'))}"
+    )
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
-        found["gpu"] = f"{properties.name}, {properties.total_memory >> 30} GiB, CUDA {torch.version.cuda}"
+        found["gpu"] = (
+            f"{properties.name}, {properties.total_memory >> 30} GiB, CUDA {torch.version.cuda}"
+        )
     return found
 
 
@@ -93,8 +112,16 @@ def infer(capture: str, out: str, device: str, runs: int) -> Row:
     report = json.loads((Path(out) / Path(capture).name / "report.json").read_text("utf-8"))
     seconds = report["seconds"]
     computed = sum(seconds[stage] for stage in ("distil", "estimate", "indirect_light", "refine"))
-    found = {"pixels": report["n_pixels"], "pixels_per_second": round(report["n_pixels"] / computed)}
-    return {**found, "seconds": seconds, "distillation": report["distillation"], "peak_gpu_mib": peak_gpu_mib()}
+    found = {
+        "pixels": report["n_pixels"],
+        "pixels_per_second": round(report["n_pixels"] / computed),
+    }
+    return {
+        **found,
+        "seconds": seconds,
+        "distillation": report["distillation"],
+        "peak_gpu_mib": peak_gpu_mib(),
+    }
 
 
 def infer_large(megapixels: float, work: str, device: str) -> Row:
@@ -128,11 +155,13 @@ def mean_errors(captures: Sequence[str], out: str, device: str, methods: Sequenc
     return {f"{result['method']} on {result['capture']}": result["mae_deg"] for result in results}
 
 
-def train_steps(preset: str, changes: Sequence[Row], device: str, size: Size, same_batches: bool) -> Row:
+def train_steps(
+    preset: str, changes: Sequence[Row], device: str, size: Size, same_batches: bool
+) -> Row:
     """Return losses and times of some steps of a preset.
 
-    With `same_batches`, pixels are drawn on the processor, because the GPU has other random numbers. Captures are
-    always photographed with the processor's.
+    With `same_batches`, pixels are drawn on the processor, because the GPU has other random
+    numbers. Captures are always photographed with the processor's.
     """
     import torch
     from splinecli.system.devices import choose_device
@@ -169,23 +198,33 @@ def moved(value: Any, device: Any) -> Any:
     if isinstance(value, list | tuple):
         return type(value)(moved(part, device) for part in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.replace(value, **{name: moved(part, device) for name, part in vars(value).items()})
+        return dataclasses.replace(
+            value, **{name: moved(part, device) for name, part in vars(value).items()}
+        )
     return value.to(device) if hasattr(value, "to") else value
 
 
 def finish_set(folder: str) -> Row:
-    """Finish a pixel set whose rendering was interrupted. Raises RuntimeError if it has too few scenes."""
+    """Finish a pixel set whose rendering was interrupted. Raises RuntimeError if it has too few
+    scenes.
+    """
     from splinecli.workshop.pixel_sets.store import PixelSetWriter
 
     entries = PixelSetWriter(Path(folder)).finish().entries
     shapes = len({entry.scene for entry in entries})
     if shapes < 2:
         raise RuntimeError(f"{shapes} shapes are rendered; training and validation need one each")
-    return {"entries": len(entries), "shapes": shapes, "pixels": sum(entry.n_pixels for entry in entries)}
+    return {
+        "entries": len(entries),
+        "shapes": shapes,
+        "pixels": sum(entry.n_pixels for entry in entries),
+    }
 
 
 def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: float) -> Row:
-    """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of it at most."""
+    """Train the refinement nets until `ends`, in Unix time. Photographing first takes about half of
+    it at most.
+    """
     from splinecli.cli.console import Messages
     from splinecli.workshop.training import tasks
     from splinecli.workshop.training.config import configure
@@ -196,7 +235,9 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
 
     usual, held = tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES
     share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (max(1, round(share * number)) for number in (usual, held))
+    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (
+        max(1, round(share * number)) for number in (usual, held)
+    )
     config = configure("refine", None, [{"sources": {pixel_set: 1.0}, "minutes": minutes_left()}])
     with open_run(
         config, Path(run), device, resume=False, tensorboard=False, observer=Messages(quiet=False)
@@ -216,7 +257,9 @@ class Session:
         self.out, self.work, self.ends = out, work, ends
         self.entries: list[Row] = []
 
-    def step(self, name: str, call: Callable[..., Row], *arguments: Any, seconds: float | None = None) -> Row | None:
+    def step(
+        self, name: str, call: Callable[..., Row], *arguments: Any, seconds: float | None = None
+    ) -> Row | None:
         """Add the result of a call to the report and return it, or None if it failed.
 
         With a limit of seconds, it is called in a process of its own; see `child`.
@@ -224,7 +267,11 @@ class Session:
         started = time.time()
         entry: Row = {"step": name}
         try:
-            entry["result"] = call(*arguments) if seconds is None else self.child(call, *arguments, seconds=seconds)
+            entry["result"] = (
+                call(*arguments)
+                if seconds is None
+                else self.child(call, *arguments, seconds=seconds)
+            )
         except Exception as error:
             entry["error"] = f"{type(error).__name__}: {error}"
         entry["seconds"] = round(time.time() - started, 1)
@@ -237,7 +284,8 @@ class Session:
     def child(self, call: Callable[..., Row | None], *arguments: Any, seconds: float) -> Any:
         """Return the result of a call in a process of its own.
 
-        Raises TimeoutError after some seconds, at the latest at the session's end; RuntimeError if the call fails.
+        Raises TimeoutError after some seconds, at the latest at the session's end; RuntimeError if
+        the call fails.
         """
         seconds = min(seconds, self.ends - time.time())
         if seconds < LEAST_SECONDS:
@@ -265,7 +313,9 @@ class Session:
         return result
 
 
-def _answer(sender: Connection, log: str, call: Callable[..., Any], arguments: Sequence[Any]) -> None:
+def _answer(
+    sender: Connection, log: str, call: Callable[..., Any], arguments: Sequence[Any]
+) -> None:
     """Send (problem, result) of a call, whose output goes to a log."""
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
@@ -288,7 +338,9 @@ def as_text(entry: Row) -> str:
     lines = [f"{entry['step']} ({entry['seconds']} s)"]
     lines += [f"    FAILED {line}" for line in entry.get("error", "").splitlines()]
     for name, value in (entry.get("result") or {}).items():
-        rows = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+        rows = (
+            value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+        )
         lines += [f"    {name}: {_words(row)}" for row in rows]
     return "\n".join(lines) + "\n"
 
@@ -306,10 +358,13 @@ def compare_inference(session: Session, size: Size, device: str, captures: Seque
     places = {device: device, "processor": "cpu"}
     for name, place in places.items():
         out = str(session.work / f"infer-{name}")
-        session.step(f"infer medallion, {name}", infer, MEDALLION, out, place, size.runs, seconds=90)
+        session.step(
+            f"infer medallion, {name}", infer, MEDALLION, out, place, size.runs, seconds=90
+        )
     maps = [str(session.work / f"infer-{name}/medallion/normals.npy") for name in places]
     session.step("angle between the normal maps", normals_apart, *maps, seconds=30)
-    # In a process that has done no other linear algebra: https://github.com/pytorch/pytorch/issues/90613
+    # In a process that has done no other linear algebra:
+    # https://github.com/pytorch/pytorch/issues/90613
     first = [MEDALLION], str(session.work / "evaluate-ia14"), device, ("ia14",)
     session.step(f"evaluate ia14 alone, {device}", mean_errors, *first, seconds=60)
     errors = []
@@ -320,8 +375,12 @@ def compare_inference(session: Session, size: Size, device: str, captures: Seque
     session.step("evaluate, difference of the MAE in degrees", lambda: common)
 
 
-def compare_training(session: Session, size: Size, device: str, preset: str, sources: Sequence[Row]) -> Row | None:
-    """Compare steps of a preset on the device and on the processor; return the device's row, None if it failed."""
+def compare_training(
+    session: Session, size: Size, device: str, preset: str, sources: Sequence[Row]
+) -> Row | None:
+    """Compare steps of a preset on the device and on the processor; return the device's row, None
+    if it failed.
+    """
     exact = [*sources, {"precision": "float32"}]
     found = {
         name: session.step(f"train {preset}, {name}", train_steps, preset, *how, seconds=75)
@@ -338,13 +397,19 @@ def compare_training(session: Session, size: Size, device: str, preset: str, sou
 
 
 def scenes_to_render(data: Path | None, size: Size) -> list[str]:
-    """Return options of `prepare` for more scenes than there is time for: views of meshes, or without any random ones.
+    """Return options of `prepare` for more scenes than there is time for: views of meshes, or
+    without any random ones.
 
-    Shapes of the statues are left out, because they are for measuring: statues/maria_specular is one of shapes/maria.
+    Shapes of the statues are left out, because they are for measuring: statues/maria_specular is
+    one of shapes/maria.
     """
     options = [*size.scene, "--workers", "auto"]
     statues = tuple(path.name.split("_")[0] for path in data.glob("statues/*")) if data else ()
-    meshes = [path for path in sorted(data.glob("shapes/*.ply")) if not path.name.startswith(statues)] if data else []
+    meshes = (
+        [path for path in sorted(data.glob("shapes/*.ply")) if not path.name.startswith(statues)]
+        if data
+        else []
+    )
     if data is None or not meshes:
         return [*options, "--scenes", "200"]
     files = {"--mesh": meshes, "--relief": sorted(data.glob("relief/*.jpg"))}
@@ -371,28 +436,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path)
     parser.add_argument("--data", default="")
     parser.add_argument("--minutes", type=float, default=12)
-    parser.add_argument("--started", type=float, default=time.time(), help="when the minutes began, in Unix time")
+    parser.add_argument(
+        "--started", type=float, default=time.time(), help="when the minutes began, in Unix time"
+    )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--size", choices=SIZES, default="full")
-    parser.add_argument("--work", type=Path, help="a folder for what is not kept, with the log of the installation")
+    parser.add_argument(
+        "--work", type=Path, help="a folder for what is not kept, with the log of the installation"
+    )
     options = parser.parse_args(arguments)
     size, device, total = SIZES[options.size], options.device, 60 * options.minutes
     data = Path(options.data) if options.data else None
     work = options.work or Path(tempfile.mkdtemp())
     options.out.mkdir(parents=True, exist_ok=True)
     session = Session(options.out, work, options.started + total - STOP_SECONDS)
-    installed = {"seconds": time.time() - options.started, "problems": problems(work / "install.log")}
+    installed = {
+        "seconds": time.time() - options.started,
+        "problems": problems(work / "install.log"),
+    }
     session.step("install", lambda: installed)
     found = session.step("machine", machine, seconds=60)
     if found is None or (device == "cuda" and "gpu" not in found):
         print("PyTorch finds no GPU: nothing else is measured", file=sys.stderr)
         return 1
-    compare_inference(session, size, device, [MEDALLION, *map(str, sorted(data.glob("statues/*")) if data else ())])
+    compare_inference(
+        session,
+        size,
+        device,
+        [MEDALLION, *map(str, sorted(data.glob("statues/*")) if data else ())],
+    )
     compare_training(session, size, device, "compact", [])
     pixel_set, run = str(work / "scenes"), str(options.out / "refine")
-    rendered = max(LEAST_RENDERED_SHARE * total, session.ends - time.time() - (1 - RENDERED_SHARE) * total)
+    rendered = max(
+        LEAST_RENDERED_SHARE * total, session.ends - time.time() - (1 - RENDERED_SHARE) * total
+    )
     with ThreadPoolExecutor(1) as thread:
-        rendering = thread.submit(render, session, scenes_to_render(data, size), pixel_set, rendered)
+        rendering = thread.submit(
+            render, session, scenes_to_render(data, size), pixel_set, rendered
+        )
         for megapixels in size.megapixels:
             name = f"infer {megapixels} megapixels, {device}, while scenes are rendered"
             session.step(name, infer_large, megapixels, str(work), device, seconds=150)
@@ -400,7 +481,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if scenes is not None:
         row = compare_training(session, size, device, "refine", [{"sources": {pixel_set: 1.0}}])
         capture_seconds = row["capture_seconds"] if row else 1.0
-        session.step("train", train, pixel_set, run, device, session.ends, capture_seconds, seconds=total)
+        session.step(
+            "train", train, pixel_set, run, device, session.ends, capture_seconds, seconds=total
+        )
     return int(any("error" in entry for entry in session.entries))
 
 

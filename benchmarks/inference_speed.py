@@ -1,10 +1,12 @@
-"""Measure the pixels per second of the shipped network and of the paper's, and the whole `infer` command.
+"""Measure the pixels per second of the shipped network and of the paper's, and the whole `infer`
+command.
 
 python benchmarks/inference_speed.py [CAPTURE]
 
-The networks run on the CPU, on --pixels generated pixels under ten random lights; the paper's network, which is much
-slower, gets a thirty-second of them. Each figure is the median over --repeats runs, after one warm-up. With a CAPTURE
-(such as DiLiGenT's catPNG), the whole command is measured too, with ten lights, in processes of its own.
+The networks run on the CPU, on --pixels generated pixels under ten random lights; the paper's
+network, which is much slower, gets a thirty-second of them. Each figure is the median over
+--repeats runs, after one warm-up. With a CAPTURE (such as DiLiGenT's catPNG), the whole command is
+measured too, with ten lights, in processes of its own.
 """
 
 import argparse
@@ -25,7 +27,9 @@ from splinecli.system.machine import choose_precision
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 
-def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, repeats: int) -> float:
+def pixels_per_second(
+    loaded: LoadedNetwork, precision: Precision, pixels: int, repeats: int
+) -> float:
     """Return the median speed over the repeats."""
     config = PixelGeneratorConfig(min_lights=10, max_lights=10)
     batch = PixelGenerator(config, torch.Generator().manual_seed(0)).draw(pixels)
@@ -44,7 +48,17 @@ def command_seconds(capture: str, repeats: int) -> float:
     seconds = []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as out:
-            command = [sys.executable, "-m", "splinecli", "infer", capture, "--n-lights", "10", "-o", out]
+            command = [
+                sys.executable,
+                "-m",
+                "splinecli",
+                "infer",
+                capture,
+                "--n-lights",
+                "10",
+                "-o",
+                out,
+            ]
             started = time.perf_counter()
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             seconds.append(time.perf_counter() - started)
@@ -52,10 +66,16 @@ def command_seconds(capture: str, repeats: int) -> float:
 
 
 def speeds(pixels: int, repeats: int) -> dict[str, float]:
-    """Return the pixels per second of the paper's layers, and of the shipped network in both number formats."""
-    paper_network = SplineNet(NetworkConfig(size="paper")).eval().to(memory_format=torch.channels_last)
+    """Return the pixels per second of the paper's layers, and of the shipped network in both number
+    formats.
+    """
+    paper_network = (
+        SplineNet(NetworkConfig(size="paper")).eval().to(memory_format=torch.channels_last)
+    )
     paper = LoadedNetwork(paper_network, "paper", "")
-    found = {"layers of the paper, float32": pixels_per_second(paper, "float32", pixels // 32, repeats)}
+    found = {
+        "layers of the paper, float32": pixels_per_second(paper, "float32", pixels // 32, repeats)
+    }
     shipped = resolve_weights("spline-net")
     precisions: tuple[Precision, ...] = ("float32", "bfloat16")
     for precision in precisions:
@@ -71,7 +91,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
     chosen = choose_precision("auto", torch.device("cpu"))
-    print(f"{torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}; auto is {chosen}")
+    print(
+        f"{torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}; auto is"
+        f" {chosen}"
+    )
     found = speeds(options.pixels, options.repeats)
     first = next(iter(found.values()))
     for name, speed in found.items():

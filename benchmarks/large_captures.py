@@ -1,13 +1,14 @@
-"""Measure time and memory of `infer` against the size of the capture.
+r"""Measure time and memory of `infer` against the size of the capture.
 
-python benchmarks/large_captures.py [--megapixels 0.05 0.5 2 6 24] [--method spline-net] [--formats png,npy] \
-    [--plot FILE.png] [--avx2]
+python benchmarks/large_captures.py [--megapixels 0.05 0.5 2 6 24] [--method spline-net] [--formats
+    png,npy] \ [--plot FILE.png] [--avx2]
 
-Each capture is a smooth bumpy relief with a glossy half: ten 16-bit RGB images in PNG files under ten lights, with
-noise, all pixels in the mask. Each run is a process of its own. The table has the seconds of the report (reading,
-estimating, writing), those of all processor cores together, and the largest memory. On a busy machine, only the
-processor's seconds mean something, and they only beside others of the same run. --plot draws these and the memory
-against the size. --avx2 measures a processor without AVX-512 and bfloat16, as in most laptops.
+Each capture is a smooth bumpy relief with a glossy half: ten 16-bit RGB images in PNG files under
+ten lights, with noise, all pixels in the mask. Each run is a process of its own. The table has the
+seconds of the report (reading, estimating, writing), those of all processor cores together, and the
+largest memory. On a busy machine, only the processor's seconds mean something, and they only beside
+others of the same run. --plot draws these and the memory against the size. --avx2 measures a
+processor without AVX-512 and bfloat16, as in most laptops.
 """
 
 import argparse
@@ -26,7 +27,11 @@ from numpy.typing import NDArray
 
 LIGHTS = 10
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "write")
-AVX2 = {"ATEN_CPU_CAPABILITY": "avx2", "DNNL_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
+AVX2 = {
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "DNNL_MAX_CPU_ISA": "AVX2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+}
 COLOUR = np.array((0.8, 1.0, 0.7), np.float32)
 
 
@@ -76,15 +81,21 @@ def draw_plot(path: Path, rows: Sequence[tuple[float, float, float]]) -> None:
 
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     sizes, *columns = zip(*rows, strict=True)
-    for axes, values, name in zip(figure.subplots(1, 2), columns, ("processor (s)", "memory (MiB)"), strict=True):
+    for axes, values, name in zip(
+        figure.subplots(1, 2), columns, ("processor (s)", "memory (MiB)"), strict=True
+    ):
         axes.plot(sizes, values, marker="o")
         axes.set(xlabel="megapixels", ylabel=name, xlim=(0, None), ylim=(0, None))
         axes.grid(visible=True, alpha=0.3)
     figure.savefig(path, dpi=100)
 
 
-def measure(megapixels: float, method: str, formats: str, avx2: bool = False) -> tuple[float, dict[str, Any]]:
-    """Return the seconds of all processor cores that `infer` takes for a capture of this size, and its report."""
+def measure(
+    megapixels: float, method: str, formats: str, avx2: bool = False
+) -> tuple[float, dict[str, Any]]:
+    """Return the seconds of all processor cores that `infer` takes for a capture of this size, and
+    its report.
+    """
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "relief"
         folder.mkdir()
@@ -94,9 +105,13 @@ def measure(megapixels: float, method: str, formats: str, avx2: bool = False) ->
         command += ["--method", method, "--format", formats]
         command += ["--precision", "float32"] * avx2
         environment = {**os.environ, **(AVX2 if avx2 else {})}
-        (report,) = json.loads(subprocess.run(command, check=True, capture_output=True, env=environment).stdout)
+        (report,) = json.loads(
+            subprocess.run(command, check=True, capture_output=True, env=environment).stdout
+        )
         after = os.times()
-    used = after.children_user + after.children_system - before.children_user - before.children_system
+    used = (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
     return used, report
 
 
@@ -109,7 +124,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--plot", type=Path, help="a PNG file")
     options = parser.parse_args(arguments)
     rows = []
-    print("megapixels", *(f"{stage[:9]:>9}" for stage in STAGES), "    total processor    memory  unlike")
+    print(
+        "megapixels",
+        *(f"{stage[:9]:>9}" for stage in STAGES),
+        "    total processor    memory  unlike",
+    )
     for megapixels in options.megapixels:
         processor, report = measure(megapixels, options.method, options.formats, options.avx2)
         width, height = report["image_size"]

@@ -1,14 +1,15 @@
 """How accurate estimated materials are, on rendered scenes.
 
-python benchmarks/materials.py [--seed 7001] [--scenes 20] [--size 64] [--sets diffuse-2 specular-2 metallic-2]
-                               [--method spline-net]
+python benchmarks/materials.py [--seed 7001] [--scenes 20] [--size 64] [--sets diffuse-2 specular-2
+                               metallic-2] [--method spline-net]
 
-Each scene is rendered in each of the sets of materials under 40 lights, of which ten are drawn. The normals are the
-true ones, or those of a method. A highlight is observable in a pixel if, under one of the ten lights, the facets'
-distribution reaches half of its peak and the facets give 15 % of the observation. Prints the mean absolute error of
-roughness, the share of pixels whose metalness is right at a threshold of 0.5, and the mean and median relative error of
-the base, up to one factor for each scene; a single error counts as 1 at most. Then prints how well pictures under the
-other 30 lights agree with the rendered ones, for the material and for a matte surface.
+Each scene is rendered in each of the sets of materials under 40 lights, of which ten are drawn. The
+normals are the true ones, or those of a method. A highlight is observable in a pixel if, under one
+of the ten lights, the facets' distribution reaches half of its peak and the facets give 15 % of the
+observation. Prints the mean absolute error of roughness, the share of pixels whose metalness is
+right at a threshold of 0.5, and the mean and median relative error of the base, up to one factor
+for each scene; a single error counts as 1 at most. Then prints how well pictures under the other 30
+lights agree with the rendered ones, for the material and for a matte surface.
 """
 
 import argparse
@@ -53,18 +54,24 @@ def examples(seed: int, scenes: int, config: SceneConfig, sets: Sequence[str]) -
         scene = draw_scene(seed, index, config)
         rendered = render_scene(scene, config)
         visible = find_visible_surface(Tracer(scene.mesh), config.size, config.samples)
-        patches = scene.patch_of_face[visible.samples.triangle].reshape(-1, visible.samples_per_pixel)
+        patches = scene.patch_of_face[visible.samples.triangle].reshape(
+            -1, visible.samples_per_pixel
+        )
         patch = torch.from_numpy(np.sort(patches, axis=1)[:, visible.samples_per_pixel // 2])
         for name in sets:
             drawn = np.sort(rng.choice(config.lights, DRAWN, replace=False))
             true = scene.materials[name].take(patch)
-            yield Example(f"{index} {name}", rendered, rendered.observations[name], scene.lights, true, drawn)
+            yield Example(
+                f"{index} {name}", rendered, rendered.observations[name], scene.lights, true, drawn
+            )
 
 
 def observable(given: Capture, normals: Floats, true: PrincipledMaterial) -> NDArray[np.bool_]:
     """Return in which pixels (P,) a highlight is observable; see above."""
     directions = torch.from_numpy(given.light_directions.astype(np.float32))
-    n_dot_l, n_dot_v, l_dot_v, _ = Geometry.of(torch.from_numpy(normals), directions, torch.zeros(len(normals)))
+    n_dot_l, n_dot_v, l_dot_v, _ = Geometry.of(
+        torch.from_numpy(normals), directions, torch.zeros(len(normals))
+    )
     n_dot_h = ((n_dot_l + n_dot_v) / (2 * (1 + l_dot_v)).sqrt()).clamp(0, 1)
     alpha_squared = (true.roughness**4).clamp(min=1e-4)
     lobe = (alpha_squared / (n_dot_h**2 * (alpha_squared - 1) + 1)) ** 2
@@ -75,7 +82,9 @@ def observable(given: Capture, normals: Floats, true: PrincipledMaterial) -> NDA
 
     lit = n_dot_l.clamp(min=0)
     facets = f0 * lobe / alpha_squared * smith(lit) * smith(n_dot_v) * lit
-    seen = (lobe >= 0.5) & (n_dot_l > 0.05) & (facets >= 0.15 * torch.from_numpy(given.observations))
+    seen = (
+        (lobe >= 0.5) & (n_dot_l > 0.05) & (facets >= 0.15 * torch.from_numpy(given.observations))
+    )
     return seen.any(1).numpy()
 
 
@@ -89,7 +98,11 @@ def judge(example: Example, method: str | None) -> tuple[Floats, Floats]:
         light_directions=lights[drawn].astype(np.float64),
         light_indices=tuple(map(int, drawn)),
     )
-    normals, confidence, error_deg = rendered.normals, np.full(len(rendered.normals), 0.999, np.float32), 0.0
+    normals, confidence, error_deg = (
+        rendered.normals,
+        np.full(len(rendered.normals), 0.999, np.float32),
+        0.0,
+    )
     if method is not None:
         found_normals = estimate_normals(given, make_estimator(method))
         normals = found_normals.normal_map[rendered.mask]
@@ -119,14 +132,19 @@ def judge(example: Example, method: str | None) -> tuple[Floats, Floats]:
     normal_map = np.zeros((*rendered.mask.shape, 3), np.float32)
     normal_map[rendered.mask] = normals
     reached = lights_that_reach(normal_map, rendered.mask, lights[held])
-    ours = likeness(observations[:, held], render_gray(found, normals, lights[held], reached, confidence))
+    ours = likeness(
+        observations[:, held], render_gray(found, normals, lights[held], reached, confidence)
+    )
     matte = likeness(observations[:, held], lambertian(given, normals, lights[held]) * reached)
     print(
-        f"{name}: normals {error_deg:.1f} degrees, material {ours.psnr_db} dB, {ours.error:.3f}; matte"
+        f"{name}: normals {error_deg:.1f} degrees, material {ours.psnr_db} dB, {ours.error:.3f};"
+        " matte"
         f" {matte.psnr_db} dB, {matte.error:.3f}",
         flush=True,
     )
-    return np.stack(columns, axis=1), np.array((ours.psnr_db, ours.error, matte.psnr_db, matte.error, error_deg))
+    return np.stack(columns, axis=1), np.array(
+        (ours.psnr_db, ours.error, matte.psnr_db, matte.error, error_deg)
+    )
 
 
 def report(rows: Sequence[tuple[Floats, Floats]]) -> None:
@@ -134,9 +152,13 @@ def report(rows: Sequence[tuple[Floats, Floats]]) -> None:
     table = np.concatenate([pixels for pixels, _ in rows])
     seen, confidence = table[:, 3] == 1, table[:, 4]
     parts = {"all": seen | True, "highlight observable": seen}
-    parts |= {"confidence 0.7 and more": confidence >= 0.7, "confidence below 0.1": confidence < 0.1}
+    parts |= {
+        "confidence 0.7 and more": confidence >= 0.7,
+        "confidence below 0.1": confidence < 0.1,
+    }
     print(
-        "| pixels | share | roughness | metalness right | base, mean | base, median |\n|---|---:|---:|---:|---:|---:|"
+        "| pixels | share | roughness | metalness right | base, mean | base, median"
+        " |\n|---|---:|---:|---:|---:|---:|"
     )
     for words, part in parts.items():
         roughness, metal, base = table[part, :3].T if part.any() else np.full((3, 1), np.nan)
@@ -144,13 +166,24 @@ def report(rows: Sequence[tuple[Floats, Floats]]) -> None:
         print(f"| {words} | " + " | ".join(f"{cell:.3f}" for cell in cells) + " |")
     relit = np.stack([scene for _, scene in rows])
     gain, less = relit[:, 0] - relit[:, 2], relit[:, 3] - relit[:, 1]
-    print(f"normals {relit[:, 4].mean():.2f} degrees; material {relit[:, 0].mean():.2f} dB, {relit[:, 1].mean():.4f};")
-    print(f"matte {relit[:, 2].mean():.2f} dB, {relit[:, 3].mean():.4f}; gain {gain.mean():.2f} dB, {less.mean():.4f},")
-    print(f"least {gain.min():.2f} dB, {less.min():.4f}; worse in {np.mean(gain < 0):.0%} and {np.mean(less < 0):.0%}")
+    print(
+        f"normals {relit[:, 4].mean():.2f} degrees; material {relit[:, 0].mean():.2f} dB,"
+        f" {relit[:, 1].mean():.4f};"
+    )
+    print(
+        f"matte {relit[:, 2].mean():.2f} dB, {relit[:, 3].mean():.4f}; gain {gain.mean():.2f} dB,"
+        f" {less.mean():.4f},"
+    )
+    print(
+        f"least {gain.min():.2f} dB, {less.min():.4f}; worse in {np.mean(gain < 0):.0%} and"
+        f" {np.mean(less < 0):.0%}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=7001)
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--size", type=int, default=64)

@@ -2,10 +2,11 @@
 
     python benchmarks/near_lamps.py [--size 96] [--method iw12] [--widths 2 4 8] [--off 0.8 1.2]
 
-Renders a sphere, a relief and a plane under ten points of light at some distances, in widths of the object, and under
-distant lights of the same directions. Prints the mean angular error in degrees under distant lights; then for each
-distance that of lights taken as distant ("no"), of near lamps at their true distance ("yes"), and at a distance that
-is wrong by these factors. For the plane, also the range of its heights in percent of its width.
+Renders a sphere, a relief and a plane under ten points of light at some distances, in widths of the
+object, and under distant lights of the same directions. Prints the mean angular error in degrees
+under distant lights; then for each distance that of lights taken as distant ("no"), of near lamps
+at their true distance ("yes"), and at a distance that is wrong by these factors. For the plane,
+also the range of its heights in percent of its width.
 """
 
 import argparse
@@ -29,9 +30,17 @@ from splinecli.workshop.synthesis.scenes import render_direct
 
 # Angles of the ten lamps from the viewing direction and azimuths in degrees, as placed by hand.
 LAMPS_DEG = (
-    (18, 75), (22, 200), (26, 318), (40, 15), (44, 62),
-    (38, 118), (48, 160), (42, 222), (52, 268), (46, 330),
-)  # fmt: skip
+    (18, 75),
+    (22, 200),
+    (26, 318),
+    (40, 15),
+    (44, 62),
+    (38, 118),
+    (48, 160),
+    (42, 222),
+    (52, 268),
+    (46, 330),
+)
 
 SAMPLES = 3
 """Samples along a side of a pixel."""
@@ -39,18 +48,25 @@ SAMPLES = 3
 
 def light_directions() -> NDArray[np.float64]:
     tilt, azimuth = np.radians(np.array(LAMPS_DEG, np.float64)).T
-    return np.stack((np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)), axis=1)
+    return np.stack(
+        (np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)), axis=1
+    )
 
 
 def height_field(name: str, count: int = 401) -> Mesh:
-    """Return a mesh over the camera's square, with exact normals; the sphere's edge falls off to a plane far below."""
+    """Return a mesh over the camera's square, with exact normals; the sphere's edge falls off to a
+    plane far below.
+    """
     place = np.linspace(-1.05, 1.05, count)
     x, y = np.meshgrid(place, place)
     zero = np.zeros_like(x)
     heights, slope_x, slope_y = zero, zero, zero
     if name == "relief":
         heights = 0.12 * np.sin(5 * x) * np.cos(4 * y)
-        slope_x, slope_y = 0.6 * np.cos(5 * x) * np.cos(4 * y), -0.48 * np.sin(5 * x) * np.sin(4 * y)
+        slope_x, slope_y = (
+            0.6 * np.cos(5 * x) * np.cos(4 * y),
+            -0.48 * np.sin(5 * x) * np.sin(4 * y),
+        )
     normals = np.stack((-slope_x, -slope_y, zero + 1), axis=-1).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
@@ -63,7 +79,9 @@ def height_field(name: str, count: int = 401) -> Mesh:
 
 def sphere(radius: float = 0.9, count: int = 300) -> Mesh:
     """Return a sphere of meridians and parallels, with exact normals."""
-    polar, azimuth = np.meshgrid(np.linspace(0.002, np.pi - 0.002, count), np.linspace(0, 2 * np.pi, 2 * count))
+    polar, azimuth = np.meshgrid(
+        np.linspace(0.002, np.pi - 0.002, count), np.linspace(0, 2 * np.pi, 2 * count)
+    )
     normals = np.stack(
         (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), axis=-1
     ).reshape(-1, 3)
@@ -116,11 +134,15 @@ class Bench:
 
     def under_distant_lights(self) -> Capture:
         lights = light_directions().astype(np.float32)
-        images = render_direct(self._tracer, self._visible, lights, self._materials, self._patches)["one"]
+        images = render_direct(self._tracer, self._visible, lights, self._materials, self._patches)[
+            "one"
+        ]
         return self._capture(images)
 
     def under_lamps(self, distance: float, *, off: float | None) -> Capture:
-        """Return the capture with lamps at a distance. It says that they are at `off` times that; None is distant."""
+        """Return the capture with lamps at a distance. It says that they are at `off` times that;
+        None is distant.
+        """
         positions = light_directions() * distance
         images = render_point_lights(
             self._tracer, self._visible, positions + self._mean, self._materials, self._patches
@@ -181,7 +203,9 @@ def measure(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--method", default="iw12")
     parser.add_argument("--widths", type=float, nargs="+", default=[2, 4, 8])
@@ -193,7 +217,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not columns:
             columns = ["scene", *(name for name, _ in cells)]
             print("  ".join(f"{text:>14}" for text in columns))
-        texts = (f"{mae:.2f}" + ("" if high is None else f" ({high:.1f} %)") for _, (mae, high) in cells)
+        texts = (
+            f"{mae:.2f}" + ("" if high is None else f" ({high:.1f} %)") for _, (mae, high) in cells
+        )
         print("  ".join(f"{text:>14}" for text in (scene, *texts)), flush=True)
 
 

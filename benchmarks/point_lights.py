@@ -1,4 +1,6 @@
-"""Radiance under points of light at finite distances: direct light with cast shadows, and no indirect light."""
+"""Radiance under points of light at finite distances: direct light with cast shadows, and no
+indirect light.
+"""
 
 import numpy as np
 import torch
@@ -17,10 +19,11 @@ def render_point_lights(
     materials: Materials,
     patch_of_face: NDArray[np.int64],
 ) -> dict[str, Tensor]:
-    """Return radiances (P, F) of each material under points of light at positions (F, 3) in the mesh's frame.
+    """Return radiances (P, F) of each material under points of light at positions (F, 3) in the
+    mesh's frame.
 
-    The radiance of a matte white surface that faces a light is 1 where the surface is as far from the light as the
-    frame's origin is. It falls with the square of the distance.
+    The radiance of a matte white surface that faces a light is 1 where the surface is as far from
+    the light as the frame's origin is. It falls with the square of the distance.
     """
     pixels, samples = len(visible.normals), visible.samples_per_pixel
     radiance = {name: torch.empty(pixels, len(positions)) for name in materials}
@@ -32,22 +35,31 @@ def render_point_lights(
         cosines = np.einsum("nfc,nc->nf", directions, hits.normal)
         lit = np.stack(
             [
-                tracer.lit(hits.lifted(), cosines[:, light : light + 1] > 0, directions[:, light])[:, 0]
+                tracer.lit(hits.lifted(), cosines[:, light : light + 1] > 0, directions[:, light])[
+                    :, 0
+                ]
                 for light in range(len(positions))
             ],
             axis=1,
         )
         shading = torch.from_numpy((cosines * lit).astype(np.float32))
         patches = torch.from_numpy(patch_of_face[hits.triangle])
-        towards_camera, above = torch.from_numpy(hits.normal[:, 2:]), torch.from_numpy(directions[..., 2])
+        towards_camera, above = (
+            torch.from_numpy(hits.normal[:, 2:]),
+            torch.from_numpy(directions[..., 2]),
+        )
         for name, material in materials.items():
-            shaded = material.take(patches).shade(shading, towards_camera, above) * torch.from_numpy(falloff)
+            shaded = material.take(patches).shade(
+                shading, towards_camera, above
+            ) * torch.from_numpy(falloff)
             radiance[name][rows] = shaded.view(len(rows), samples, -1).mean(dim=1)
     return before_black(radiance, visible)
 
 
 def _light_at(hits: Hits, positions: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the unit directions (N, F, 3) to the lights, and their falloff (N, F), 1 at the origin."""
+    """Return the unit directions (N, F, 3) to the lights, and their falloff (N, F), 1 at the
+    origin.
+    """
     towards = positions - hits.position[:, None].astype(np.float64)
     distance = np.linalg.norm(towards, axis=2)
     falloff = (np.linalg.norm(positions, axis=1) / distance) ** 2

@@ -1,13 +1,15 @@
 """How far rendered scenes are from Mitsuba 3's.
 
-python benchmarks/render_accuracy.py [--size 96] [--samples 512] [--scenes 3] [--first 1000] [--bounces 4]
+python benchmarks/render_accuracy.py [--size 96] [--samples 512] [--scenes 3] [--first 1000]
+[--bounces 4]
 
-Renders scenes that no default seed uses, in each class of materials under five lights from overhead to low, and
-compares them with Mitsuba's path tracer (depth 6, principled BSDF), pixel by pixel: the mean absolute difference
-over the mean. Normals are compared with Mitsuba's shading normals. Mitsuba's own noise, from the difference of its
-two halves of samples, is part of what is printed.
+Renders scenes that no default seed uses, in each class of materials under five lights from overhead
+to low, and compares them with Mitsuba's path tracer (depth 6, principled BSDF), pixel by pixel: the
+mean absolute difference over the mean. Normals are compared with Mitsuba's shading normals.
+Mitsuba's own noise, from the difference of its two halves of samples, is part of what is printed.
 
-Mitsuba takes one specular reflectance for a whole shape, so it is rounded to a few levels here, in both.
+Mitsuba takes one specular reflectance for a whole shape, so it is rounded to a few levels here, in
+both.
 """
 
 import argparse
@@ -61,7 +63,9 @@ def comparable(scene: Scene) -> Scene:
 
 
 def mitsuba_shapes(scene: Scene, class_name: str) -> dict[str, Any]:
-    """The mesh in parts of one specular reflectance each, with the other parameters on its faces."""
+    """The mesh in parts of one specular reflectance each, with the other parameters on its
+    faces.
+    """
     import mitsuba as mi
 
     material = scene.materials[class_name]
@@ -88,7 +92,13 @@ def mitsuba_shapes(scene: Scene, class_name: str) -> dict[str, Any]:
         )
         properties = mi.Properties()
         properties["bsdf"] = bsdf
-        mesh = mi.Mesh(f"part{number}", len(scene.mesh.vertices), int(kept.sum()), properties, has_vertex_normals=True)
+        mesh = mi.Mesh(
+            f"part{number}",
+            len(scene.mesh.vertices),
+            int(kept.sum()),
+            properties,
+            has_vertex_normals=True,
+        )
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = scene.mesh.vertices.ravel()
         parameters["vertex_normals"] = scene.mesh.vertex_normals.ravel()
@@ -110,7 +120,9 @@ def render_with_mitsuba(
     depth: int = 6,
     seed: int = 0,
 ) -> NDArray[np.float32]:
-    """Image (H, W) under a light (3,), or without one the sum of the samples' shading normals (H, W, 3)."""
+    """Image (H, W) under a light (3,), or without one the sum of the samples' shading normals (H,
+    W, 3).
+    """
     import mitsuba as mi
 
     world = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
@@ -150,7 +162,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     mi.set_variant("scalar_rgb")
     parser = argparse.ArgumentParser()
-    for name, value in (("size", 96), ("samples", 512), ("scenes", 3), ("first", 1000), ("bounces", 4)):
+    for name, value in (
+        ("size", 96),
+        ("samples", 512),
+        ("scenes", 3),
+        ("first", 1000),
+        ("bounces", 4),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
     for name in ("directions", "subsamples"):
         parser.add_argument(f"--{name}", type=int)
@@ -174,7 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         angle = np.degrees(np.arccos(np.clip((normals * ours.normals).sum(axis=1), -1, 1)))
         print(
-            f"{index} {scene.shape}: {patches} patches, {len(scene.mesh.faces)} faces, {len(ours.normals)} pixels; "
+            f"{index} {scene.shape}: {patches} patches, {len(scene.mesh.faces)} faces,"
+            f" {len(ours.normals)} pixels; "
             f"drawn in {seconds:.1f} s; normals {angle.mean():.3f} deg"
         )
         for name in CLASSES:
@@ -183,7 +202,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for column, light in enumerate(lights()):
                 halves = [
                     render_with_mitsuba(
-                        shapes, config.size, options.samples // 2, light, depth=options.bounces + 2, seed=seed
+                        shapes,
+                        config.size,
+                        options.samples // 2,
+                        light,
+                        depth=options.bounces + 2,
+                        seed=seed,
                     )[ours.mask]
                     for seed in (0, 1)
                 ]
@@ -191,13 +215,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 # The halves differ by twice the noise of their mean.
                 noise = np.abs(halves[0] - halves[1]).mean() / 2 / truth.mean()
                 mine = ours.observations[name][:, column]
-                rows.append((np.abs(mine - truth).mean() / truth.mean(), mine.mean() / truth.mean() - 1, noise))
+                rows.append(
+                    (
+                        np.abs(mine - truth).mean() / truth.mean(),
+                        mine.mean() / truth.mean() - 1,
+                        noise,
+                    )
+                )
             errors = np.array(rows)
             total[name].append(float(errors[:, 0].mean()))
             by_light = " ".join(f"{100 * error:5.1f}" for error in errors[:, 0])
             print(
                 f"  {name:9} {100 * errors[:, 0].mean():5.2f} % (by light {by_light}), mean "
-                f"{100 * errors[:, 1].mean():+.2f} %, Mitsuba's noise {100 * errors[:, 2].mean():.2f} %",
+                f"{100 * errors[:, 1].mean():+.2f} %, Mitsuba's noise"
+                f" {100 * errors[:, 2].mean():.2f} %",
                 flush=True,
             )
     print("  ".join(f"{name} {100 * np.mean(errors):.2f} %" for name, errors in total.items()))

@@ -3,9 +3,9 @@
     python benchmarks/train_light_net.py render FOLDER --scenes 960
     python benchmarks/train_light_net.py train FOLDER --minutes 85 -o light-net.safetensors
 
-Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials each, in two legs
-of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from the first with a rate of 0.0012, and had
-twice the scenes.
+Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials
+each, in two legs of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from the
+first with a rate of 0.0012, and had twice the scenes.
 """
 
 import argparse
@@ -24,7 +24,13 @@ from splinecli.system.weight_files import save_module
 from splinecli.workshop.synthesis import draw_number, shapes
 from splinecli.workshop.synthesis.draw_materials import CLASSES
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
-from splinecli.workshop.synthesis.meshes import Mesh, ellipsoid, fit_to_frame, smooth_union, triangulate
+from splinecli.workshop.synthesis.meshes import (
+    Mesh,
+    ellipsoid,
+    fit_to_frame,
+    smooth_union,
+    triangulate,
+)
 from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.workshop.synthesis.whole_capture import add_background
 
@@ -37,7 +43,9 @@ RATE = 2e-3
 
 
 def render(folder: Path, scenes: int, seed: int = 1) -> None:
-    """Render scenes that the folder does not have: random shapes, and smooth ones, which are rare among them."""
+    """Render scenes that the folder does not have: random shapes, and smooth ones, which are rare
+    among them.
+    """
     shapes.SPACING, shapes.FEWEST_FACES = SPACING, FEWEST_FACES
     folder.mkdir(parents=True, exist_ok=True)
     for index in range(scenes):
@@ -48,7 +56,9 @@ def render(folder: Path, scenes: int, seed: int = 1) -> None:
         mesh = draw_smooth(rng) if rng.random() < SMOOTH_SHARE else None
         scene = draw_scene(seed, index, CONFIG, mesh)
         done = render_scene(scene, CONFIG)
-        observations = {name: values.astype(np.float16) for name, values in done.observations.items()}
+        observations = {
+            name: values.astype(np.float16) for name, values in done.observations.items()
+        }
         new = path.with_suffix(".tmp.npz")
         np.savez(new, mask=done.mask, lights=scene.lights, **observations)
         new.replace(path)
@@ -62,7 +72,10 @@ def draw_smooth(rng: np.random.Generator) -> Mesh:
         solids = [ellipsoid(np.full(3, 0.6, np.float32))]
     else:
         radii = [rng.uniform(0.25, 0.6) * rng.uniform(0.5, 1.3, 3) for _ in range(count)]
-        solids = [shapes._place(ellipsoid(radius.astype(np.float32)), rng, (0.0, 0.45)) for radius in radii]
+        solids = [
+            shapes._place(ellipsoid(radius.astype(np.float32)), rng, (0.0, 0.45))
+            for radius in radii
+        ]
     blend = rng.uniform(0.03, 0.3)
 
     def distance(points: np.ndarray) -> np.ndarray:
@@ -77,7 +90,9 @@ def draw_smooth(rng: np.random.Generator) -> Mesh:
 
 
 class Captures(IterableDataset):
-    """Endless batches of captures: inputs (B, F, C, S, S), directions (B, F, 3) and log intensities (B, F)."""
+    """Endless batches of captures: inputs (B, F, C, S, S), directions (B, F, 3) and log intensities
+    (B, F).
+    """
 
     def __init__(self, folder: Path, first: int, *, held: bool) -> None:
         files = sorted(folder.glob("*[0-9].npz"))
@@ -96,15 +111,21 @@ class Captures(IterableDataset):
             while len(captures) < max(2, min(MOST_CAPTURES, IMAGES_PER_STEP // lights)):
                 file = self.files[int(torch.randint(len(self.files), (), generator=generator))]
                 captures += photograph(file, lights, generator)
-            images, directions, intensities = (torch.stack(part) for part in zip(*captures, strict=True))
+            images, directions, intensities = (
+                torch.stack(part) for part in zip(*captures, strict=True)
+            )
             yield images, directions, intensities
             step += 1
 
 
-def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Photograph a scene under `count` lights, with the faults of a capture; an empty list where too little is seen.
+def photograph(
+    file: Path, count: int, generator: torch.Generator
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Photograph a scene under `count` lights, with the faults of a capture; an empty list where
+    too little is seen.
 
-    30 % of the captures show a part of the object, 25 % its background; 60 % have intensities that nobody measured.
+    30 % of the captures show a part of the object, 25 % its background; 60 % have intensities that
+    nobody measured.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> float:
@@ -115,7 +136,9 @@ def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple
         chosen = choose(lights, count, generator)
         lights = lights[chosen]
         images = torch.zeros(count, *mask.shape)
-        images[:, mask] = torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
+        images[:, mask] = (
+            torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
+        )
     if uniform() < 0.3:
         side = int(min(mask.shape) * uniform(0.35, 0.8))
         top, left = (int(uniform(0, size - side)) for size in mask.shape)
@@ -141,9 +164,13 @@ def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple
     sigma = 0.0 if uniform() < 0.4 else uniform(0, 0.5) * math.log(2)
     intensities = sigma * torch.randn(count, generator=generator)
     images = images * intensities.exp()[:, None, None]
-    brightest = images[:, inside > 0].flatten().quantile(1 - 10 ** uniform(-3.5, -1.5)).clamp(min=1e-6)
+    brightest = (
+        images[:, inside > 0].flatten().quantile(1 - 10 ** uniform(-3.5, -1.5)).clamp(min=1e-6)
+    )
     images = (images / brightest * uniform(0.4, 1)).clamp(max=1)
-    noise = 10 ** uniform(-3.5, -1.8) * inside + 10 ** uniform(-3.5, -2) * images.clamp(min=0).sqrt()
+    noise = (
+        10 ** uniform(-3.5, -1.8) * inside + 10 ** uniform(-3.5, -2) * images.clamp(min=0).sqrt()
+    )
     images = (images + noise * torch.randn(images.shape, generator=generator)).clamp(min=0)
     if uniform() < 0.15:  # light that is always there
         images = images + uniform(0, 0.03) * images[:, inside > 0].mean() * inside
@@ -154,7 +181,9 @@ def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple
 
 
 def choose(lights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose lights (F, 3) within a cone, or those next to the lights of a rig; return their indices."""
+    """Choose lights (F, 3) within a cone, or those next to the lights of a rig; return their
+    indices.
+    """
     if draw_number(generator) < 0.5:
         chosen = choose_in_cone(lights, count, generator)
         return chosen[torch.randperm(count, generator=generator)]
@@ -166,12 +195,18 @@ def choose(lights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return chosen
 
 
-def losses(network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the negative log likelihood of the directions, their mean angle in radians, and the error of the logs."""
+def losses(
+    network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the negative log likelihood of the directions, their mean angle in radians, and the
+    error of the logs.
+    """
     guess = network(images.float())
     cosine = (guess.directions * directions).sum(dim=-1)
     sharpness = guess.sharpness.exp()
-    likelihood = sharpness * (1 - cosine) - guess.sharpness + torch.log1p(-torch.exp(-2 * sharpness))
+    likelihood = (
+        sharpness * (1 - cosine) - guess.sharpness + torch.log1p(-torch.exp(-2 * sharpness))
+    )
     angle = cosine.clamp(-0.99999, 0.99999).acos()
     return likelihood.mean(), angle.mean(), (guess.log_intensities - intensities).abs().mean()
 
@@ -179,7 +214,9 @@ def losses(network: LightNet, images: Tensor, directions: Tensor, intensities: T
 def train(folder: Path, minutes: float, output: Path) -> None:
     """Train for so many minutes, and write the running average of the weights."""
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()  # type: ignore[call-overload]
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True)
+    optimiser = torch.optim.AdamW(
+        network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
+    )
     checkpoint, step = output.with_suffix(".checkpoint"), 0
     average.load_state_dict(network.state_dict())
     if checkpoint.exists():
@@ -187,7 +224,11 @@ def train(folder: Path, minutes: float, output: Path) -> None:
         for part, name in ((network, "network"), (average, "average"), (optimiser, "optimiser")):
             part.load_state_dict(state[name])
         step = state["step"]
-    batches = iter(DataLoader(Captures(folder, step, held=False), batch_size=None, num_workers=1, prefetch_factor=6))
+    batches = iter(
+        DataLoader(
+            Captures(folder, step, held=False), batch_size=None, num_workers=1, prefetch_factor=6
+        )
+    )
     begin = time.time()
     while (done := (time.time() - begin) / 60 / minutes) < 1:
         rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * done)) / 2 + 1e-6
@@ -214,11 +255,15 @@ def train(folder: Path, minutes: float, output: Path) -> None:
 def validate(network: LightNet, folder: Path, batches: int = 40) -> float:
     """Return the mean error of the directions in degrees on captures of held scenes."""
     held = iter(Captures(folder, 0, held=True))
-    return math.degrees(sum(float(losses(network, *next(held))[1]) for _ in range(batches)) / batches)
+    return math.degrees(
+        sum(float(losses(network, *next(held))[1]) for _ in range(batches)) / batches
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("step", choices=("render", "train"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=960)

@@ -3,9 +3,10 @@
     python benchmarks/train_material_net.py draw FOLDER
     python benchmarks/train_material_net.py train FOLDER [--steps 16000] [--ship]
 
-Both go on after an interruption. The pixels are those of the training of spline-net: their materials and faults are
-described in synthesis/. The network's tokens for them are stored, because it is not changed. A shard of 512 captures
-takes about a minute on one core and 22 MB, and 1,000 steps take half a minute.
+Both go on after an interruption. The pixels are those of the training of spline-net: their
+materials and faults are described in synthesis/. The network's tokens for them are stored, because
+it is not changed. A shard of 512 captures takes about a minute on one core and 22 MB, and 1,000
+steps take half a minute.
 """
 
 import argparse
@@ -40,7 +41,8 @@ class Batch(NamedTuple):
     """Pixels of CAPTURES captures. Pixel p belongs to capture p % CAPTURES."""
 
     pixels: PixelTokens
-    targets: Tensor  # (P, 6): roughness, metallic, log base, log level, minnaert and tail; see Gloss
+    # (P, 6): roughness, metallic, log base, log level, minnaert and tail; see Gloss
+    targets: Tensor
 
 
 @torch.inference_mode()
@@ -62,8 +64,12 @@ def draw(folder: Path, shards: int) -> None:
                 )
             assert context is not None and isinstance(batch.truth, PixelScene)
             own, shown = batch.truth.material, batch.exposure / pixels.scale
-            logs = [(value * shown).clamp(1e-4, 1e3).log() for value in (own.base, 0.08 * own.specular)]
-            targets = torch.cat((own.roughness, own.metallic, *logs, own.minnaert, own.tail_exponent), dim=1)
+            logs = [
+                (value * shown).clamp(1e-4, 1e3).log() for value in (own.base, 0.08 * own.specular)
+            ]
+            targets = torch.cat(
+                (own.roughness, own.metallic, *logs, own.minnaert, own.tail_exponent), dim=1
+            )
             relative = pixels.scale / context.brightness.repeat(PIXELS)[:, None]
             rows.append((pixels.tokens.half(), pixels.normal_z, relative, pixels.n_lights, targets))
         named = zip((*PixelTokens._fields, "targets"), zip(*rows, strict=True), strict=True)
@@ -74,17 +80,20 @@ def draw(folder: Path, shards: int) -> None:
 
 
 def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
-    """Draw a batch as PixelGenerator does; if they are narrow, with the normals of reliefs, plates and tilted parts.
+    """Draw a batch as PixelGenerator does; if they are narrow, with the normals of reliefs, plates
+    and tilted parts.
 
-    The normals of a capture are then drawn together by a factor of 10^U(-2, 0), about a direction 0 to 60 degrees from
-    the camera axis. Whether a highlight is visible depends on them.
+    The normals of a capture are then drawn together by a factor of 10^U(-2, 0), about a direction 0
+    to 60 degrees from the camera axis. Whether a highlight is visible depends on them.
     """
     config, pixels = PixelGeneratorConfig(capture_pixels=PIXELS), CAPTURES * PIXELS
     scene = draw_scene(pixels, config, generator)
     if are_narrow:
         polar = draw_uniform(generator, CAPTURES, 1, high=math.radians(60))
         azimuth = draw_uniform(generator, CAPTURES, 1, high=2 * math.pi)
-        middle = torch.cat((polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()), dim=1)
+        middle = torch.cat(
+            (polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()), dim=1
+        )
         share = 10 ** draw_uniform(generator, CAPTURES, 1, low=-2.0)
 
         def narrow(normals: Tensor) -> Tensor:
@@ -96,10 +105,14 @@ def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
         if mixed is not None:
             mixed = replace(mixed, normals=narrow(mixed.normals))
         scene = replace(scene, normals=narrow(scene.normals), mixed=mixed)
-    counts = draw_light_counts(CAPTURES, config.min_lights, config.max_lights, config.usual_lights, generator)
+    counts = draw_light_counts(
+        CAPTURES, config.min_lights, config.max_lights, config.usual_lights, generator
+    )
     directions = draw_light_directions(CAPTURES, int(counts.max()), generator).repeat(PIXELS, 1, 1)
     valid = torch.arange(directions.shape[1]) < counts.repeat(PIXELS)[:, None]
-    return photograph_captures(scene, scene.radiance(directions), directions, valid, config, generator)
+    return photograph_captures(
+        scene, scene.radiance(directions), directions, valid, config, generator
+    )
 
 
 def read(paths: list[Path]) -> list[Batch]:
@@ -108,7 +121,10 @@ def read(paths: list[Path]) -> list[Batch]:
     for path in paths:
         shard = load_file(path)
         parts = zip(*(shard[name] for name in PixelTokens._fields), strict=True)
-        found += [Batch(PixelTokens(*part), own) for part, own in zip(parts, shard["targets"], strict=True)]
+        found += [
+            Batch(PixelTokens(*part), own)
+            for part, own in zip(parts, shard["targets"], strict=True)
+        ]
     return found
 
 
@@ -120,17 +136,27 @@ def forward(network: MaterialNet, batch: Batch) -> Gloss:
 
 
 def loss_of(found: Gloss, targets: Tensor) -> Tensor:
-    """Return the loss: absolute errors, the first two with the Laplace distributions that the network predicts."""
+    """Return the loss: absolute errors, the first two with the Laplace distributions that the
+    network predicts.
+    """
     roughness, metallic, log_base, log_level, minnaert, tail = targets.unbind(dim=1)
-    wrong = (found.roughness - roughness).abs() / found.roughness_error + found.roughness_error.log()
-    base = (found.log_base - log_base).abs().clamp(max=3) / found.log_base_error + found.log_base_error.log()
+    wrong = (
+        found.roughness - roughness
+    ).abs() / found.roughness_error + found.roughness_error.log()
+    base = (found.log_base - log_base).abs().clamp(
+        max=3
+    ) / found.log_base_error + found.log_base_error.log()
     dielectric = 0.2 * (found.log_level - log_level).abs() + 0.5 * (found.minnaert - minnaert).abs()
     kind = binary_cross_entropy(found.metalness, metallic, reduction="none")
-    return (wrong + kind + 0.5 * base + (1 - metallic) * dielectric + 0.3 * (found.tail - tail).abs()).mean()
+    return (
+        wrong + kind + 0.5 * base + (1 - metallic) * dielectric + 0.3 * (found.tail - tail).abs()
+    ).mean()
 
 
 def train(folder: Path, steps: int) -> MaterialNet:
-    """Train on the shards of a folder but the first and last, and return the running average of the weights."""
+    """Train on the shards of a folder but the first and last, and return the running average of the
+    weights.
+    """
     torch.manual_seed(0)
     paths = sorted(folder.glob("*.safetensors"))
     batches, held = read(paths[1:-1]), read(paths[:1] + paths[-1:])
@@ -144,7 +170,9 @@ def train(folder: Path, steps: int) -> MaterialNet:
             part.load_state_dict(state[name])
         first = state["step"]
     for step in range(first, steps):
-        rate = RATE * min(1, (step + 1) / 100) * ((1 + math.cos(math.pi * step / steps)) / 2 + 0.005)
+        rate = (
+            RATE * min(1, (step + 1) / 100) * ((1 + math.cos(math.pi * step / steps)) / 2 + 0.005)
+        )
         for group in optimiser.param_groups:
             group["lr"] = rate
         generator = torch.Generator().manual_seed(step)
@@ -159,7 +187,10 @@ def train(folder: Path, steps: int) -> MaterialNet:
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - kept)
         if (step + 1) % 500 == 0:
             parts = {"network": network, "average": average, "optimiser": optimiser}
-            torch.save({name: part.state_dict() for name, part in parts.items()} | {"step": step + 1}, checkpoint)
+            torch.save(
+                {name: part.state_dict() for name, part in parts.items()} | {"step": step + 1},
+                checkpoint,
+            )
             print(step + 1, validate(average, held), flush=True)
     return average.eval()
 
@@ -173,13 +204,20 @@ def validate(network: MaterialNet, held: list[Batch]) -> str:
         metal = (found.metalness > 0.5) == (true[:, 1] > 0.5)
         base = ((found.log_base - true[:, 2]).exp() - 1).abs().clamp(max=1)
         inside = (found.roughness - true[:, 0]).abs() < found.roughness_error * math.log(2)
-        rows.append(torch.stack(((found.roughness - true[:, 0]).abs(), metal, base, inside), dim=1).mean(0))
+        rows.append(
+            torch.stack(((found.roughness - true[:, 0]).abs(), metal, base, inside), dim=1).mean(0)
+        )
     roughness, metal, base, inside = torch.stack(rows).mean(0).tolist()
-    return f"roughness {roughness:.4f}, metalness right {metal:.3f}, base {base:.3f}; within median error {inside:.3f}"
+    return (
+        f"roughness {roughness:.4f}, metalness right {metal:.3f}, base {base:.3f}; within median"
+        f" error {inside:.3f}"
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("step", choices=("draw", "train"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--shards", type=int, default=48)

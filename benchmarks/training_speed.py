@@ -2,8 +2,8 @@
 
 python benchmarks/training_speed.py [SET] [--device cuda] [--batch-size N]
 
-The pixels come from the pixel set SET, or from the online generator. Each figure is a mean over --steps steps, after
---warm-up steps that are not counted.
+The pixels come from the pixel set SET, or from the online generator. Each figure is a mean over
+--steps steps, after --warm-up steps that are not counted.
 """
 
 import argparse
@@ -25,7 +25,9 @@ LOSSES = {"symmetric_weight": 2e-2, "asymmetric_weight": 2e-5}
 
 
 def variants() -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield the measured presets: (printed name, preset, changed settings). The refinement net trains on no pixels."""
+    """Yield the measured presets: (printed name, preset, changed settings). The refinement net
+    trains on no pixels.
+    """
     for name, preset in PRESETS.items():
         if preset.updates == "refine_net":
             continue

@@ -2,9 +2,10 @@
 
 python benchmarks/wrong_lights.py CAPTURE... [--scenes 20] [--draws 20] [--lights 12]
 
-Of each capture, draws of lights are checked (all lights where it has no more). Each draw is checked as it is and in
-every wrong way. Scenes that no default seed uses are rendered in all classes of materials. Prints a table in
-Markdown: how many are named / how many get the right mend, of how many.
+Of each capture, draws of lights are checked (all lights where it has no more). Each draw is checked
+as it is and in every wrong way. Scenes that no default seed uses are rendered in all classes of
+materials. Prints a table in Markdown: how many are named / how many get the right mend, of how
+many.
 """
 
 import argparse
@@ -35,11 +36,17 @@ FRAMES = {
 }
 FIRST_SCENE, SEED = 5000, 71
 Lit = tuple[str, Array, Array, NDArray[np.bool_], bool]
-"""Name, observations (P, F), lights (F, 3), mask (H, W), and whether a file gives the intensities of the lights."""
+"""Name, observations (P, F), lights (F, 3), mask (H, W), and whether a file gives the intensities
+of the lights.
+"""
 
 
-def wrong_files(lights: Array, rng: np.random.Generator) -> Iterator[tuple[str, Array, Callable[[LightCheck], bool]]]:
-    """Yield the name of each kind of file, the lights as it gives them, and whether a check's mend is the right one."""
+def wrong_files(
+    lights: Array, rng: np.random.Generator
+) -> Iterator[tuple[str, Array, Callable[[LightCheck], bool]]]:
+    """Yield the name of each kind of file, the lights as it gives them, and whether a check's mend
+    is the right one.
+    """
     n_lights = len(lights)
     yield "right", lights, lambda check: True
     for name, frame in FRAMES.items():
@@ -64,7 +71,9 @@ def mends(check: LightCheck, frame: str) -> bool:
     if check.order is not None or check.best is None:
         return False
     proposed = (check.best, mirror_twin(check, check.best))
-    return parse_light_frame(frame) in [candidate.frame for candidate in proposed if candidate is not None]
+    return parse_light_frame(frame) in [
+        candidate.frame for candidate in proposed if candidate is not None
+    ]
 
 
 def words(check: LightCheck) -> str:
@@ -72,14 +81,18 @@ def words(check: LightCheck) -> str:
 
 
 def rendered(count: int, n_lights: int) -> Iterator[Lit]:
-    """Yield rendered scenes, by their class of material, with lights up to 60 degrees from the view."""
+    """Yield rendered scenes, by their class of material, with lights up to 60 degrees from the
+    view.
+    """
     config = SceneConfig(size=80, lights=4, samples=2, directions=48, bounces=2)
     for index in range(FIRST_SCENE, FIRST_SCENE + count):
         scene = draw_scene(SEED, index, config)
         rng = np.random.default_rng([SEED, index])
         z, azimuth = rng.uniform(0.5, 0.99, n_lights), rng.uniform(0, 2 * np.pi, n_lights)
         radius = np.sqrt(1 - z * z)
-        lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1).astype(np.float32)
+        lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1).astype(
+            np.float32
+        )
         result = render_scene(dataclasses.replace(scene, lights=lights), config)
         for name, observations in result.observations.items():
             yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask, True
@@ -88,7 +101,8 @@ def rendered(count: int, n_lights: int) -> Iterator[Lit]:
 def real(folders: Sequence[Path], n_lights: int, draws: int) -> Iterator[Lit]:
     for folder in folders:
         source = open_capture(folder)
-        # As the check of infer, it sees no intensities that were estimated under the lights in question.
+        # As the check of infer, it sees no intensities that were estimated under the lights in
+        # question.
         capture, known = source.read(as_stored=True), source.intensities_measured
         wanted = n_lights if n_lights < capture.n_lights else None
         for draw in draw_lights(capture.light_directions, wanted, trials=draws, seed=SEED):
@@ -100,7 +114,9 @@ def real(folders: Sequence[Path], n_lights: int, draws: int) -> Iterator[Lit]:
 def count(
     captures: Sequence[Path], scenes: int, *, draws: int, n_lights: int
 ) -> dict[str, dict[str, tuple[int, int, int]]]:
-    """Return for each kind of file and each capture or class: how many are named, get the right mend, there are."""
+    """Return for each kind of file and each capture or class: how many are named, get the right
+    mend, there are.
+    """
     counts: dict[str, dict[str, tuple[int, int, int]]] = {}
     rng = np.random.default_rng(SEED)
     for source in (real(captures, n_lights, draws), rendered(scenes, n_lights)):
@@ -109,7 +125,9 @@ def count(
             for kind, given, is_right in wrong_files(lights, rng):
                 factors = find_factors(sample.observations, intensities_known=known)
                 check = check_lights(sample.observations, sample.mask, given, factors=factors)
-                doubted = check.order is not None or check.best is not None or check.odd_image is not None
+                doubted = (
+                    check.order is not None or check.best is not None or check.odd_image is not None
+                )
                 named, mended, total = counts.setdefault(kind, {}).get(name, (0, 0, 0))
                 mended += doubted and is_right(check)
                 counts[kind][name] = named + doubted, mended, total + 1
@@ -121,7 +139,9 @@ def cell(kind: str, named: int, mended: int, total: int) -> str:
 
 
 def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str, float | str]:
-    """Return one kind of file for all photographs, for metal, and for all other rendered scenes together."""
+    """Return one kind of file for all photographs, for metal, and for all other rendered scenes
+    together.
+    """
     sums: dict[str, NDArray[np.integer]] = {}
     for name, found in by_name.items():
         group = "diffuse, specular" if name.startswith("rendered") else "photographs"
@@ -131,7 +151,9 @@ def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str,
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--draws", type=int, default=20)
@@ -139,7 +161,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     counts = count(options.captures, options.scenes, draws=options.draws, n_lights=options.lights)
-    print("| light file |", " | ".join(counts["right"]), "|\n|---|" + "---:|" * len(counts["right"]))
+    print(
+        "| light file |", " | ".join(counts["right"]), "|\n|---|" + "---:|" * len(counts["right"])
+    )
     for kind, by_name in counts.items():
         print(f"| {kind} |", " | ".join(cell(kind, *found) for found in by_name.values()), "|")
 

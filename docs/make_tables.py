@@ -1,8 +1,10 @@
-"""Write the tables of the documentation that follow from tables of the source: warnings, methods and maps.
+"""Write the tables of the documentation that follow from tables of the source: warnings, methods
+and maps.
 
     .venv/bin/python docs/make_tables.py
 
-A table stands between `<!-- table: NAME -->` and `<!-- end -->`. A test checks that it is up to date.
+A table stands between `<!-- table: NAME -->` and `<!-- end -->`. A test checks that it is up to
+date.
 """
 
 import re
@@ -20,7 +22,9 @@ PAGES = ("warnings.md", "compared_methods.md", "results.md")
 def warnings_table() -> list[str]:
     """Return the rows of all warnings."""
     kinds = [WARNINGS[code] for code in sorted(WARNINGS)]
-    rows = [(f"`{kind.code}`", kind.meaning, kind.remedy, "error" * kind.is_error) for kind in kinds]
+    rows = [
+        (f"`{kind.code}`", kind.meaning, kind.remedy, "error" * kind.is_error) for kind in kinds
+    ]
     return table(("code", "meaning", "remedy", "`--strict`"), rows)
 
 
@@ -32,7 +36,10 @@ def methods_table() -> list[str]:
 
 def maps_table() -> list[str]:
     """Return the rows of all maps that --maps adds."""
-    rows = [(f"`{m.name}`", ", ".join(f"`{name}`" for name in m.files.values()), m.content) for m in MAPS.values()]
+    rows = [
+        (f"`{m.name}`", ", ".join(f"`{name}`" for name in m.files.values()), m.content)
+        for m in MAPS.values()
+    ]
     return table(("map", "files", "content"), rows)
 
 

@@ -1,6 +1,8 @@
-"""Add to the site the pages that are not in docs/: the README as the first page, other pages, one page per command.
+"""Add to the site the pages that are not in docs/: the README as the first page, other pages, one
+page per command.
 
-mkdocs.yml names this file as a hook. Links lead from file to file of the repository; here they get the site's layout.
+mkdocs.yml names this file as a hook. Links lead from file to file of the repository; here they get
+the site's layout.
 """
 
 import posixpath
@@ -14,14 +16,23 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "MODEL_CARD.md", "CREDITS.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
+PAGES = (
+    "README.md",
+    "MODEL_CARD.md",
+    "CREDITS.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "examples/README.md",
+)
 SCRIPTS = ("examples/python_api.py", "examples/train_shipped_weights.sh")
 COMMANDS = "commands"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name in (*PAGES, *SCRIPTS):
-        files.append(File.generated(config, site_name(name), content=(ROOT / name).read_text("utf-8")))
+        files.append(
+            File.generated(config, site_name(name), content=(ROOT / name).read_text("utf-8"))
+        )
     for name, text in command_pages().items():
         files.append(File.generated(config, f"{COMMANDS}/{name}.md", content=text))
     return files
@@ -77,7 +88,9 @@ def command_pages() -> dict[str, str]:
             lines += [plain(words), "", "```sh", line, "```", ""]
         for title, rows in help_panels(command, own).items():
             lines += [f"## {title}", "", "| option | meaning |", "|---|---|"]
-            lines += [f"| `{term}` | {plain(meaning)} |".replace("\n", " ") for term, meaning in rows]
+            lines += [
+                f"| `{term}` | {plain(meaning)} |".replace("\n", " ") for term, meaning in rows
+            ]
             lines.append("")
         pages[name] = "\n".join(lines)
     return pages

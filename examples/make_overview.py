@@ -1,4 +1,5 @@
-"""Draw the picture at the top of the README: ten photographs, their normal map, and the surface relit.
+"""Draw the picture at the top of the README: ten photographs, their normal map, and the surface
+relit.
 
     python examples/make_overview.py [FILE]        # default: docs/pictures/overview.png
 
@@ -36,18 +37,33 @@ LIGHT = (-0.75, -0.25, 0.6)
 """Direction of the new light: low, from the lower left, where none of the ten lights stands."""
 
 LEVELS_TOGETHER = 4
-"""Colours are rounded to every fourth of 256 levels: nobody sees it, and the file is a third smaller."""
+"""Colours are rounded to every fourth of 256 levels: nobody sees it, and the file is a third
+smaller.
+"""
 
 SPECULAR_GAIN, SHININESS = 0.08, 40
-"""Strength and exponent of the highlight (normalised Blinn-Phong), as on the page of `infer --html`."""
+"""Strength and exponent of the highlight (normalised Blinn-Phong), as on the page of `infer
+--html`.
+"""
 
 EXPOSURE = 1.6
 """Brightness of the photographs in the picture, relative to their stored values."""
 
 
 def infer(folder: Path) -> tuple[Array, Array]:
-    """Run `splinecli infer` on the medallion; return its normal map and its albedo map, each (H, W, 3)."""
-    command = [sys.executable, "-m", "splinecli", "infer", str(MEDALLION), "-o", str(folder), "--quiet"]
+    """Run `splinecli infer` on the medallion; return its normal map and its albedo map, each (H, W,
+    3).
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "splinecli",
+        "infer",
+        str(MEDALLION),
+        "-o",
+        str(folder),
+        "--quiet",
+    ]
     subprocess.run([*command, "--format", "npy", "--maps", "albedo"], check=True)
     results = folder / MEDALLION.name
     return np.load(results / "normals.npy"), np.load(results / "albedo.npy")
@@ -56,7 +72,8 @@ def infer(folder: Path) -> tuple[Array, Array]:
 def enlarge(values: Array, mask: Array, side: int) -> tuple[Array, Array]:
     """Resize a map (H, W, 3) and its mask (H, W) to `side` pixels.
 
-    Returns the map (side, side, 3) without any influence of the background, and the coverage (side, side) from 0 to 1.
+    Returns the map (side, side, 3) without any influence of the background, and the coverage (side,
+    side) from 0 to 1.
     """
     size, smooth = (side, side), cv2.INTER_LINEAR
     coverage = cv2.resize(mask, size, interpolation=smooth)
@@ -79,12 +96,16 @@ def photographs() -> list[NDArray[np.uint8]]:
     pictures = []
     for path in sorted(MEDALLION.glob("[0-9]*.png")):
         linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(np.float32) / 65535
-        pictures.append(encode_srgb(cv2.resize(EXPOSURE * linear, (SMALL, SMALL), interpolation=cv2.INTER_AREA)))
+        pictures.append(
+            encode_srgb(cv2.resize(EXPOSURE * linear, (SMALL, SMALL), interpolation=cv2.INTER_AREA))
+        )
     return pictures
 
 
 def overview(normals: Array, albedo: Array) -> NDArray[np.uint8]:
-    """Return the picture (HEIGHT, WIDTH, 3), RGB, of a normal map and an albedo map (H, W, 3) of the medallion."""
+    """Return the picture (HEIGHT, WIDTH, 3), RGB, of a normal map and an albedo map (H, W, 3) of
+    the medallion.
+    """
     mask = normals.any(axis=2).astype(np.float32)
     large_normals, coverage = enlarge(normals, mask, LARGE)
     large_normals = unit(large_normals)
@@ -98,14 +119,26 @@ def overview(normals: Array, albedo: Array) -> NDArray[np.uint8]:
     for row, count in enumerate(PHOTOGRAPH_ROWS):
         indent = (max(PHOTOGRAPH_ROWS) - count) * SMALL // 2
         for column in range(count):
-            paste(canvas, next(remaining), TOP + row * row_step, PHOTOGRAPHS_LEFT + indent + column * SMALL)
+            paste(
+                canvas,
+                next(remaining),
+                TOP + row * row_step,
+                PHOTOGRAPHS_LEFT + indent + column * SMALL,
+            )
     colours = encode_picture(large_normals, coverage > 0, bits=8) * coverage[..., None]
     paste(canvas, np.rint(colours).astype(np.uint8), TOP, NORMALS_LEFT)
-    paste(canvas, encode_srgb(relit(large_normals, large_albedo) * coverage[..., None]), TOP, RELIT_LEFT)
+    paste(
+        canvas,
+        encode_srgb(relit(large_normals, large_albedo) * coverage[..., None]),
+        TOP,
+        RELIT_LEFT,
+    )
 
     dpi = 100
     figure = Figure(figsize=(WIDTH / dpi, HEIGHT / dpi), dpi=dpi, facecolor="black")
-    figure.figimage(np.minimum(np.rint(canvas / LEVELS_TOGETHER) * LEVELS_TOGETHER, 255).astype(np.uint8))
+    figure.figimage(
+        np.minimum(np.rint(canvas / LEVELS_TOGETHER) * LEVELS_TOGETHER, 255).astype(np.uint8)
+    )
     for x, words in (
         (PHOTOGRAPHS_LEFT + max(PHOTOGRAPH_ROWS) * SMALL / 2, "ten photographs under ten lights"),
         (NORMALS_LEFT, "→"),

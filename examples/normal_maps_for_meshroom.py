@@ -1,14 +1,17 @@
-"""Hand normal maps of several views to multi-view tools, in the layout of AliceVision's node PhotometricStereo.
+"""Hand normal maps of several views to multi-view tools, in the layout of AliceVision's node
+PhotometricStereo.
 
     python examples/normal_maps_for_meshroom.py CAMERAS.sfm OUT RESULTS [RESULTS ...]
 
-CAMERAS.sfm (or .json) is the SfMData file of StructureFromMotion, with views, intrinsics and poses. Each RESULTS is a
-folder that `splinecli infer` wrote, with normals.npy. It belongs to the view whose photograph is in the folder of the
-capture, or has its name: capture `cat03` to `.../cat03/0001.png` or `.../cat03.png`.
+CAMERAS.sfm (or .json) is the SfMData file of StructureFromMotion, with views, intrinsics and poses.
+Each RESULTS is a folder that `splinecli infer` wrote, with normals.npy. It belongs to the view
+whose photograph is in the folder of the capture, or has its name: capture `cat03` to
+`.../cat03/0001.png` or `.../cat03.png`.
 
-For each view, OUT gets POSE_normals.exr in the camera's frame (x right, y down, z away from the camera), and
-POSE_normals_w.exr in the world's, both as float values, and POSE_mask.png. OUT/normalMaps.sfm has these views with
-their cameras. The images must be undistorted, and whole: no --crop or --scale.
+For each view, OUT gets POSE_normals.exr in the camera's frame (x right, y down, z away from the
+camera), and POSE_normals_w.exr in the world's, both as float values, and POSE_mask.png.
+OUT/normalMaps.sfm has these views with their cameras. The images must be undistorted, and whole: no
+--crop or --scale.
 """
 
 import json
@@ -22,12 +25,20 @@ from numpy.typing import NDArray
 
 from splinecli.surface.surface_files import encode_exr
 
-Y_DOWN_Z_AWAY = np.array((1, -1, -1), np.float32)  # from splinecli's frame to the camera's frame of SfMData
+Y_DOWN_Z_AWAY = np.array(
+    (1, -1, -1), np.float32
+)  # from splinecli's frame to the camera's frame of SfMData
 
 
 def view_of(capture: str, cameras: dict[str, Any]) -> dict[str, Any]:
-    """Return the view of a capture: of several with one pose, the one that has the name of the pose."""
-    views = [view for view in cameras["views"] if capture in (Path(view["path"]).stem, Path(view["path"]).parent.name)]
+    """Return the view of a capture: of several with one pose, the one that has the name of the
+    pose.
+    """
+    views = [
+        view
+        for view in cameras["views"]
+        if capture in (Path(view["path"]).stem, Path(view["path"]).parent.name)
+    ]
     named = [view for view in views if view["viewId"] == view["poseId"]]
     if not views:
         raise SystemExit(f"found no view of {capture} among the {len(cameras['views'])} views")
@@ -35,7 +46,9 @@ def view_of(capture: str, cameras: dict[str, Any]) -> dict[str, Any]:
 
 
 def rotation_of(pose_id: str, cameras: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the rotation (3, 3) from the world to the camera. SfMData stores it column by column, as text."""
+    """Return the rotation (3, 3) from the world to the camera. SfMData stores it column by column,
+    as text.
+    """
     for pose in cameras["poses"]:
         if pose["poseId"] == pose_id:
             return np.array(pose["pose"]["transform"]["rotation"], np.float64).reshape(3, 3).T
@@ -51,7 +64,10 @@ def main(cameras_file: Path, out: Path, results: list[Path]) -> None:
         mask = normals.any(axis=2)
         view = view_of(folder.name, cameras)
         if mask.shape != (int(view["height"]), int(view["width"])):
-            raise SystemExit(f"{folder} has {mask.shape[::-1]} pixels, its view {view['width']} x {view['height']}")
+            raise SystemExit(
+                f"{folder} has {mask.shape[::-1]} pixels, its view {view['width']} x"
+                f" {view['height']}"
+            )
         rotation = rotation_of(view["poseId"], cameras)
         in_camera = normals * Y_DOWN_Z_AWAY
         in_world = (in_camera @ rotation).astype(np.float32)  # rows: rotation' n

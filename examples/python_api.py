@@ -1,6 +1,8 @@
-"""Estimate the normals of the medallion from Python with two methods, and compare them with the ground truth.
+"""Estimate the normals of the medallion from Python with two methods, and compare them with the
+ground truth.
 
-python examples/python_api.py [FOLDER]        # default: out/python_api, for the pictures of the normal maps
+python examples/python_api.py [FOLDER]        # default: out/python_api, for the pictures of the
+normal maps
 """
 
 import sys
@@ -25,6 +27,8 @@ for method in ("ls", "spline-net"):
     estimate = estimate_normals(capture, make_estimator(method))
     # A capture without ground truth has no errors.
     if estimate.errors is not None:
-        print(f"{method}: MAE {estimate.errors.mean:.2f} deg, median {estimate.errors.median:.2f} deg")
+        print(
+            f"{method}: MAE {estimate.errors.mean:.2f} deg, median {estimate.errors.median:.2f} deg"
+        )
     picture = encode_picture(estimate.normal_map, capture.mask)  # 16-bit RGB; OpenCV writes BGR
     cv2.imwrite(str(folder / f"{method}.png"), picture[..., ::-1])

@@ -1,4 +1,6 @@
-"""Make the man pages and docs/reports.schema.json from the commands and documents: `python man/make_pages.py`."""
+"""Make the man pages and docs/reports.schema.json from the commands and documents: `python
+man/make_pages.py`.
+"""
 
 import inspect
 import json
@@ -26,22 +28,29 @@ EXIT_STATUS = {
     "130": "Interrupted. No file is incomplete.",
 }
 FILES = {
-    "CAPTURE/*.png, *.tif, *.jpg, *.dng, *.nef, ...": "Linear images, in natural order or in the order of"
+    "CAPTURE/*.png, *.tif, *.jpg, *.dng,"
+    " *.nef, ...": "Linear images, in natural order or in the order of"
     " filenames.txt. Camera RAW files need 'splinecli[raw]'.",
     "CAPTURE/light_directions.txt": "A line x y z for each image: x right, y up, z to the camera.",
-    "CAPTURE/*.lp, lights.json": "Instead: lights with the names of their images, from RTI or AliceVision.",
-    "CAPTURE/light_positions.txt, pixel_size.txt": "Near lamps: positions from the middle of the image on the object,"
+    "CAPTURE/*.lp,"
+    " lights.json": "Instead: lights with the names of their images, from RTI or AliceVision.",
+    "CAPTURE/light_positions.txt,"
+    " pixel_size.txt": "Near lamps: positions from the middle of the image on the object,"
     " and the width of a pixel in their unit. Optional.",
-    "CAPTURE/camera_matrix.txt": "The camera matrix in pixels. Optional: without it, the camera is orthographic.",
+    "CAPTURE/camera_matrix.txt": "The camera matrix in pixels. Optional: without it, the camera"
+    " is orthographic.",
     "CAPTURE/light_intensities.txt": "A line r g b for each image. Optional.",
-    "CAPTURE/mask.png": "White on the object (above half of its largest value). Optional: without it, every pixel"
+    "CAPTURE/mask.png": "White on the object (above half of its largest value). Optional:"
+    " without it, every pixel"
     " belongs to the object.",
     "CAPTURE/ambient.png": "The object with the lamp off, subtracted from all images. Optional.",
     "CAPTURE/Normal_gt.mat": "True normals. Optional: with them, errors are reported.",
     "OUT/NAME/normals.png": "Normal map, 16-bit RGB, (n + 1) / 2.",
     "OUT/NAME/normals.npy": "Normal map, float32, H x W x 3, zero outside the mask.",
-    "OUT/NAME/normals_8bit.png, normals.tiff, normals.exr": "With --format png8, tiff, exr: normal map in 8 bits, in"
-    " float32, in float32 for renderers. tiff and exr also write the maps below in these formats, exr depth.exr.",
+    "OUT/NAME/normals_8bit.png,"
+    " normals.tiff, normals.exr": "With --format png8, tiff, exr: normal map in 8 bits, in"
+    " float32, in float32 for renderers. tiff and exr also write the maps below in these formats,"
+    " exr depth.exr.",
     "OUT/NAME/error_map.png": "If there are true normals: angular error with a color bar.",
     "OUT/NAME/found_mask.png": "With --auto-mask: the mask of the object.",
     **{
@@ -49,11 +58,14 @@ FILES = {
         for each in MAPS.values()
     },
     "OUT/frames/NAME": "The frames of a film, a capture of its own.",
-    "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png": "With --surface, or from splinecli integrate"
+    "OUT/NAME/mesh.glb, mesh.ply, depth.npy,"
+    " depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json and, with --level, level_normals.npy and"
-    " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and mesh_metalness.png)"
+    " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and"
+    " mesh_metalness.png)"
     " and mesh.stl.",
-    "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that follows the pointer.",
+    "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that"
+    " follows the pointer.",
     "OUT/NAME/report.json": "Lights, method, weights, options, time, warnings and errors.",
     "OUT/index.html": "With several captures: links to all results.",
 }
@@ -64,35 +76,46 @@ ENVIRONMENT = {
     "CUDA_VISIBLE_DEVICES": "GPUs that --device auto and cuda may use.",
 }
 EXAMPLES = {
-    "splinecli infer obj/ --lights l.txt": "Estimate the normals of one object from all its images.",
+    "splinecli infer obj/ --lights"
+    " l.txt": "Estimate the normals of one object from all its images.",
     "splinecli infer catPNG --n-lights 10 --seed 0 --json": "Use ten lights and print the report.",
     "splinecli infer captures/* -o results --overwrite": "Process a folder of captures.",
-    "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html": "Also write albedo, preview, mesh and"
-    " page.",
+    "splinecli infer obj/ --auto-mask --maps albedo,preview"
+    " --surface --html": "Also write albedo, preview, mesh and page.",
     "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
     "splinecli info obj/": "Describe the capture as infer would read it.",
-    "splinecli info obj/ --transfer srgb --plot lights.png": "Check sRGB images, and plot the light directions.",
+    "splinecli info obj/ --transfer srgb"
+    " --plot lights.png": "Check sRGB images, and plot the light directions.",
     "splinecli calibrate chrome/ -o lights": "Measure light directions with a mirror ball.",
-    "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights": "Give the outline of the ball, and"
+    "splinecli calibrate chrome/ --circle 512,384,200"
+    " --gray-ball gray/ -o lights": "Give the outline of the ball, and"
     " also measure light intensities.",
     "splinecli integrate results/cat": "Make depth and a mesh from the results of infer.",
-    "splinecli integrate normals.png --mask mask.png --format obj -o surface": "Make a mesh from any normal map.",
-    "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20": "Compare two methods.",
-    "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10 --trials 20 --figures": "Compare all methods"
+    "splinecli integrate normals.png --mask mask.png"
+    " --format obj -o surface": "Make a mesh from any normal map.",
+    "splinecli evaluate pmsData --method ls --method spline-net"
+    " --n-lights 10 --trials 20": "Compare two methods.",
+    "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10"
+    " --trials 20 --figures": "Compare all methods"
     " with two numbers of lights, and draw their maps.",
     "splinecli prepare --scenes 6 -o set": "Render six scenes in three materials.",
     "splinecli prepare PRPS PRPS_Diffuse -o cycles": "Make a pixel set from the CyclesPS data.",
     "splinecli train set --preset compact --steps 300 -o run": "Train briefly on a pixel set.",
-    "splinecli train -o runs/mine --minutes 90": "Train new weights, then use --weights runs/mine/weights.safetensors.",
+    "splinecli train"
+    " -o runs/mine"
+    " --minutes 90": "Train new weights, then use --weights runs/mine/weights.safetensors.",
     "splinecli train -o runs/mine --resume": "Continue after an interruption.",
-    "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors": "Convert the authors' weights,"
+    "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o"
+    " official.safetensors": "Convert the authors' weights,"
     " then use --weights official.safetensors.",
 }
 EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
 
 
 def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return the title of each panel of a command's help and its rows: names, and what they mean."""
+    """Return the title of each panel of a command's help and its rows: names,
+    and what they mean.
+    """
     panels: dict[str, list[tuple[str, str]]] = {}
     for parameter in command.get_params(context):
         if (record := parameter.get_help_record(context)) is None:
@@ -100,7 +123,11 @@ def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
         term, meaning = record
         title = getattr(parameter, "rich_help_panel", None) or "Options"
         if parameter.param_type_name == "argument":
-            title, term, meaning = "Arguments", parameter.metavar, meaning.removesuffix("[required]")
+            title, term, meaning = (
+                "Arguments",
+                parameter.metavar,
+                meaning.removesuffix("[required]"),
+            )
         meaning = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", meaning)
         panels.setdefault(title, []).append((" ".join(term.split()), " ".join(meaning.split())))
     return panels
@@ -120,14 +147,20 @@ def man_pages() -> dict[str, str]:
 
 def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
     lines = [
-        *_beginning("splinecli", "surface normals from a few photographs under known lights", group, context),
+        *_beginning(
+            "splinecli", "surface normals from a few photographs under known lights", group, context
+        ),
         ".SH OPTIONS",
         *_options(help_panels(group, context)),
         ".SH COMMANDS",
     ]
     for name, command in commands.items():
         lines += [".TP", _reference(name), _escape(_paragraphs(command.help)[0])]
-    for title, rows in (("EXIT STATUS", EXIT_STATUS), ("FILES", FILES), ("ENVIRONMENT", ENVIRONMENT)):
+    for title, rows in (
+        ("EXIT STATUS", EXIT_STATUS),
+        ("FILES", FILES),
+        ("ENVIRONMENT", ENVIRONMENT),
+    ):
         lines.append(f".SH {title}")
         for term, meaning in rows.items():
             lines += [".TP", f"\\fB{_escape(term)}\\fR", _escape(meaning)]
@@ -177,7 +210,9 @@ def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
             lines.append(f".SS {_escape(title)}")
         for term, meaning in rows:
             # Bold for what is typed as it stands, italic for what stands for something.
-            words = [rf"\f{'B' if word[0] == '-' else 'I'}{_escape(word)}\fR" for word in term.split()]
+            words = [
+                rf"\f{'B' if word[0] == '-' else 'I'}{_escape(word)}\fR" for word in term.split()
+            ]
             lines += [".TP", " ".join(words), _escape(meaning)]
     return lines
 
@@ -216,7 +251,9 @@ def _paragraphs(text: str) -> list[str]:
 
 
 # Without escapes, groff turns these into typographic hyphens, quotes and accents.
-_PLAIN = str.maketrans({"\\": "\\e", "-": "\\-", "'": "\\(aq", "`": "\\(ga", "^": "\\(ha", "~": "\\(ti"})
+_PLAIN = str.maketrans(
+    {"\\": "\\e", "-": "\\-", "'": "\\(aq", "`": "\\(ga", "^": "\\(ha", "~": "\\(ti"}
+)
 
 
 def _escape(text: str) -> str:

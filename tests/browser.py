@@ -1,4 +1,6 @@
-"""One headless Chromium for all tests of a session, driven by Playwright; tests skip where there is none."""
+"""One headless Chromium for all tests of a session, driven by Playwright; tests skip where there is
+none.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 """Names of the system's Chromium on the path."""
 
 PATIENCE_MS = 180_000
-"""Limit for one step of the browser: far more than a busy machine needs, so that only a hang fails."""
+"""Limit for one step of the browser: far more than a busy machine needs, so that only a hang fails.
+"""
 
 FLAGS = (
     "--disable-dev-shm-usage",
@@ -51,7 +54,9 @@ def browser() -> Iterator[Browser]:
     with warnings.catch_warnings():
         # The tests turn warnings into errors; those of Playwright's own code are not ours.
         warnings.simplefilter("ignore")
-        api = pytest.importorskip("playwright.sync_api", reason="no Playwright: it is in the extra 'test'")
+        api = pytest.importorskip(
+            "playwright.sync_api", reason="no Playwright: it is in the extra 'test'"
+        )
         driver = api.sync_playwright().start()
     try:
         running = driver.chromium.launch(
@@ -71,11 +76,15 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser, tmp_path: Path) -> Iterator[OpenPage]:
-    """A function that opens HTML from a file, as a reader does; errors of the page's script fail the test."""
+    """A function that opens HTML from a file, as a reader does; errors of the page's script fail
+    the test.
+    """
     opened: list[Any] = []
     problems: list[str] = []
 
-    def open_html(html: str, fragment: str = "", *, width: int = 800, height: int = 600, webgl: bool = True) -> Page:
+    def open_html(
+        html: str, fragment: str = "", *, width: int = 800, height: int = 600, webgl: bool = True
+    ) -> Page:
         path = tmp_path / f"page{len(opened)}.html"
         path.write_text(html, "utf-8")
         context = browser.new_context(viewport={"width": width, "height": height})

@@ -6,7 +6,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-# The tests run in one process a core. Each of these, and the commands that they start, computes in one thread.
+# The tests run in one process a core. Each of these, and the commands that they start, computes in
+# one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
@@ -23,24 +24,32 @@ GOLDEN = Path(__file__).resolve().parent / "golden"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff")
+    parser.addoption(
+        "--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff"
+    )
 
 
 @pytest.fixture(autouse=True)
 def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Print none of the lines that come every half minute, because a busy machine would add them to compared text."""
+    """Print none of the lines that come every half minute, because a busy machine would add them to
+    compared text.
+    """
     monkeypatch.setattr("splinecli.cli.console.LINE_SECONDS", math.inf)
 
 
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Save training runs without drawing the figures, which takes longer than the run itself."""
-    monkeypatch.setattr("splinecli.workshop.training.run_files.RunLog.draw", lambda self, maps: None)
+    monkeypatch.setattr(
+        "splinecli.workshop.training.run_files.RunLog.draw", lambda self, maps: None
+    )
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Real captures that lie beside the repository on the authors' machines; none of them is part of it."""
+    """Real captures that lie beside the repository on the authors' machines; none of them is part
+    of it.
+    """
     folder = Path(__file__).resolve().parents[1] / "../shared/data"
     if not folder.is_dir():
         pytest.skip(f"no real captures in {folder}")
@@ -49,7 +58,9 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels, no shadow among them."""
+    """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels,
+    no shadow among them.
+    """
     normals, lights = cap_directions(200, 50), spiral_lights(12)
     albedo = np.random.default_rng(1).uniform(0.01, 100, (200, 1))
     return normals, lights, albedo * (normals @ lights.T)
@@ -57,14 +68,17 @@ def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np
 
 @pytest.fixture
 def glossy_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe, attached shadows."""
+    """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe,
+    attached shadows.
+    """
     normals, lights = cap_directions(60, 70), spiral_lights(14, 60)
     return normals, lights, 0.6 * shade(normals, lights, gloss=5 / 6, exponent=40)
 
 
 @pytest.fixture
 def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
-    """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the diff is read.
+    """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the
+    diff is read.
 
     What differs from run to run (seconds, memory, sizes of files, version) is blanked out.
     """
@@ -82,6 +96,8 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
 def _without_measurements(text: str) -> str:
     """The text with seconds, memory, sizes of files, version and absolute paths blanked out."""
     text = re.sub(r'("[a-z_0-9]+\.[a-z]+": )\d+', r"\1...", text)
-    text = re.sub(rf'("(?:{"|".join(STAGES)}|total|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
+    text = re.sub(
+        rf'("(?:{"|".join(STAGES)}|total|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text
+    )
     text = re.sub(r", [\d.]+ s\n", ", ... s\n", text)
     return re.sub(r'("(?:version|inputs_sha256|folder|light_file)": )"[^"]*"', r'\1"..."', text)

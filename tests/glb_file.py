@@ -14,7 +14,9 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the tree of a GLB file, and the arrays of its only mesh: attributes, "indices" and textures."""
+    """Return the tree of a GLB file, and the arrays of its only mesh: attributes, "indices" and
+    textures.
+    """
     magic, version, length, json_length, json_kind = struct.unpack("<4sIIII", content[:20])
     assert (magic, version, length, json_kind) == (b"glTF", 2, len(content), 0x4E4F534A)
     tree = json.loads(content[20 : 20 + json_length])
@@ -39,7 +41,9 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         first, content = view(accessor["bufferView"])
         assert (first + accessor.get("byteOffset", 0)) % size == 0
         width = _WIDTHS[accessor["type"]]
-        values = np.frombuffer(content, dtype, accessor["count"] * width, accessor.get("byteOffset", 0))
+        values = np.frombuffer(
+            content, dtype, accessor["count"] * width, accessor.get("byteOffset", 0)
+        )
         values = values.reshape(-1, width)
         for bound, found in (("min", values.min(axis=0)), ("max", values.max(axis=0))):
             if bound in accessor:
@@ -52,7 +56,9 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     arrays = {name: array(number) for name, number in part["attributes"].items()}
     arrays["indices"] = array(part["indices"]).reshape(-1, 3)
     assert {"min", "max"} <= set(tree["accessors"][part["attributes"]["POSITION"]])
-    assert {len(values) for name, values in arrays.items() if name != "indices"} == {len(arrays["POSITION"])}
+    assert {len(values) for name, values in arrays.items() if name != "indices"} == {
+        len(arrays["POSITION"])
+    }
     assert arrays["indices"].max() < len(arrays["POSITION"])
     for name in {"NORMAL", "TANGENT"} & set(arrays):
         np.testing.assert_allclose(np.linalg.norm(arrays[name][:, :3], axis=1), 1, atol=1e-5)

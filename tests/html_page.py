@@ -12,7 +12,9 @@ VOID = {"meta", "link", "img", "input", "br", "hr"}
 
 
 class HtmlPage(HTMLParser):
-    """The tags with their attributes, and the text by tag. An end tag that does not match its start tag fails."""
+    """The tags with their attributes, and the text by tag. An end tag that does not match its start
+    tag fails.
+    """
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -40,13 +42,29 @@ class HtmlPage(HTMLParser):
 
 
 REPORT: dict[str, Any] = {
-    "capture": "ball", "method": "spline-net", "weights": {"name": "blobby-7", "sha256": "0123456789ab" * 5},
-    "n_lights": 10, "light_indices": list(range(10)), "n_pixels": 45200, "image_size": [296, 321],
-    "device": "cpu", "precision": "float32", "peak_memory_mib": 86, "version": "0.1.0", "warnings": [],
+    "capture": "ball",
+    "method": "spline-net",
+    "weights": {"name": "blobby-7", "sha256": "0123456789ab" * 5},
+    "n_lights": 10,
+    "light_indices": list(range(10)),
+    "n_pixels": 45200,
+    "image_size": [296, 321],
+    "device": "cpu",
+    "precision": "float32",
+    "peak_memory_mib": 86,
+    "version": "0.1.0",
+    "warnings": [],
     "seconds": {"read": 0.6, "estimate": 0.008, "surface": 0.0, "total": 0.608},
-    "expected_under_5": 0.8123, "capture_judged": True,
-    "angular_error_deg": {"mean": 9.063, "median": 6.24, "p90": 18.1, "under_5": 0.3725, "under_10": 0.75},
-}  # fmt: skip
+    "expected_under_5": 0.8123,
+    "capture_judged": True,
+    "angular_error_deg": {
+        "mean": 9.063,
+        "median": 6.24,
+        "p90": 18.1,
+        "under_5": 0.3725,
+        "under_10": 0.75,
+    },
+}
 SIDE = 256
 """Pixels of the ball."""
 

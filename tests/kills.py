@@ -1,4 +1,6 @@
-"""Kill a process at a chosen step of its changes to files, and check that what it renames is on the disk before."""
+"""Kill a process at a chosen step of its changes to files, and check that what it renames is on the
+disk before.
+"""
 
 import os
 import signal
@@ -15,7 +17,11 @@ CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.syml
 def changes_files(event: str, args: tuple[object, ...]) -> bool:
     if event == "open":
         path, _, flags = args
-        return isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR)) and path != os.devnull
+        return (
+            isinstance(flags, int)
+            and bool(flags & (os.O_WRONLY | os.O_RDWR))
+            and path != os.devnull
+        )
     return event in CHANGES
 
 
@@ -58,14 +64,21 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
 
 def content(folder: Path) -> dict[str, bytes]:
     """The content of every file below a folder by its path, hidden ones included."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
-Call = tuple[str, Path, Path]  # "sync", "rename" or "remove"; the path, and for "rename" the new one
+# "sync", "rename" or "remove"; the path, and for "rename" the new one
+Call = tuple[str, Path, Path]
 
 
 def record_calls(work: Callable[[], object]) -> list[Call]:
-    """Do the work and return its calls of the system that sync, rename and remove, in their order."""
+    """Do the work and return its calls of the system that sync, rename and remove,
+    in their order.
+    """
     calls: list[Call] = []
     fsync = os.fsync
 
@@ -90,11 +103,13 @@ def record_calls(work: Callable[[], object]) -> list[Call]:
 
 
 def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
-    """Yield what was changed too early, and the folders whose names may not be on the disk at the end.
+    """Yield what was changed too early, and the folders whose names may not be on the disk at the
+    end.
 
-    A kill does not lose what was written and not synced, but a power cut does. So a file must be synced before it is
-    renamed. The removal of a report must be on the disk before any file gets its place, and the names of all these
-    files before the report gets its own. Hidden files are no results.
+    A kill does not lose what was written and not synced, but a power cut does. So a file must be
+    synced before it is renamed. The removal of a report must be on the disk before any file gets
+    its place, and the names of all these files before the report gets its own. Hidden files are no
+    results.
     """
     if not any(kind == "rename" for kind, _, _ in calls):
         yield "nothing is renamed"
@@ -107,7 +122,11 @@ def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
         elif not place.name.startswith("."):
             if kind == "rename" and path not in synced:
                 yield f"{place.name} is renamed before its content is on the disk"
-            unsynced = changed.values() if place.name == report else [n for n in changed.values() if n.name == report]
+            unsynced = (
+                changed.values()
+                if place.name == report
+                else [n for n in changed.values() if n.name == report]
+            )
             for name in unsynced:
                 yield f"{place.name} changes before {name.name} is on the disk"
             changed[place.parent] = place

@@ -23,7 +23,9 @@ def directions_at(azimuth: Floats, zenith: Floats | float) -> Floats:
 
 
 def cap_directions(count: int, limit_deg: float, seed: int = 0, *, even: bool = False) -> Floats:
-    """Random unit vectors (count, 3) within limit_deg of the view axis: even by angle, or even over the cap."""
+    """Random unit vectors (count, 3) within limit_deg of the view axis: even by angle, or even over
+    the cap.
+    """
     rng = np.random.default_rng(seed)
     azimuth, limit = rng.uniform(0, 2 * np.pi, count), np.radians(limit_deg)
     zenith = limit * (np.sqrt(rng.uniform(0, 1, count)) if even else rng.uniform(0, 1, count))
@@ -32,7 +34,9 @@ def cap_directions(count: int, limit_deg: float, seed: int = 0, *, even: bool = 
 
 def spiral_lights(count: int, limit_deg: float = 35, start_deg: float = 5) -> Floats:
     """Lights (count, 3) on a spiral, from start_deg to limit_deg from the view axis."""
-    return directions_at(np.arange(count) * 2.4, np.radians(np.linspace(start_deg, limit_deg, count)))
+    return directions_at(
+        np.arange(count) * 2.4, np.radians(np.linspace(start_deg, limit_deg, count))
+    )
 
 
 def ring_lights(count: int, zenith_deg: float = 40, first_rad: float = 0.0) -> Floats:
@@ -48,14 +52,18 @@ def square_grid(size: int, reach: float = 1.0) -> tuple[Floats, Floats]:
 
 
 def sphere(size: int, reach: float = 0.97) -> tuple[Floats, Mask]:
-    """Normals (size, size, 3) of a unit sphere that touches the frame, and the mask of radius `reach`."""
+    """Normals (size, size, 3) of a unit sphere that touches the frame, and the mask of radius
+    `reach`.
+    """
     x, y = square_grid(size)
     inside = np.hypot(x, y) < reach
     return np.stack((x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=-1), inside
 
 
 def sphere_cap(size: int, reach: float = 0.65) -> Floats:
-    """Normals (size, size, 3) of the part of a unit sphere that fills a square of half width `reach`."""
+    """Normals (size, size, 3) of the part of a unit sphere that fills a square of half width
+    `reach`.
+    """
     x, y = square_grid(size, reach)
     return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
 
@@ -66,8 +74,12 @@ def halfway(lights: Floats) -> Floats:
     return np.asarray(half / np.linalg.norm(half, axis=1, keepdims=True))
 
 
-def shade(normals: Floats, lights: Floats, *, gloss: float = 0.0, exponent: float = 30, noise: float = 0.0) -> Floats:
-    """Observations (..., F): Lambert's cosine, a Blinn-Phong lobe, attached shadows, and noise of this deviation."""
+def shade(
+    normals: Floats, lights: Floats, *, gloss: float = 0.0, exponent: float = 30, noise: float = 0.0
+) -> Floats:
+    """Observations (..., F): Lambert's cosine, a Blinn-Phong lobe, attached shadows, and noise of
+    this deviation.
+    """
     cosine = np.clip(normals @ lights.T, 0, None)
     seen = cosine + gloss * np.clip(normals @ halfway(lights).T, 0, None) ** exponent * (cosine > 0)
     if noise:
@@ -86,7 +98,9 @@ def write_capture(
     names: str = "{:03}.png",
     first: int = 0,
 ) -> Path:
-    """Write images (F, H, W) or (F, H, W, 3) RGB as PNGs, with the lights and what else is given."""
+    """Write images (F, H, W) or (F, H, W, 3) RGB as PNGs, with the lights and what else is
+    given.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images, start=first):
         stored = image if image.ndim == 2 else image[..., ::-1]
@@ -108,7 +122,12 @@ def decode_rgb(png: bytes) -> NDArray[np.uint8]:
 
 
 def png_chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+    return (
+        struct.pack(">I", len(content))
+        + name
+        + content
+        + struct.pack(">I", zlib.crc32(name + content))
+    )
 
 
 def with_chunk(png: bytes, name: bytes, content: bytes) -> bytes:
@@ -117,14 +136,27 @@ def with_chunk(png: bytes, name: bytes, content: bytes) -> bytes:
 
 
 BUMP_MM = 64.0
-BUMP_LAMPS = np.array(
-    [(0, 20, 200), (70, 10, 170), (-80, 20, 160), (20, 90, 150), (-10, -80, 170), (60, 60, 140), (-60, -70, 150)]
-) * 1.0  # fmt: skip
+BUMP_LAMPS = (
+    np.array(
+        [
+            (0, 20, 200),
+            (70, 10, 170),
+            (-80, 20, 160),
+            (20, 90, 150),
+            (-10, -80, 170),
+            (60, 60, 140),
+            (-60, -70, 150),
+        ]
+    )
+    * 1.0
+)
 """Lamps in millimetres, at about three widths of the object."""
 
 
 def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = False) -> Path:
-    """Write a matte bump of 32 x 32 pixels, 64 mm wide, without a mask or lights, under near or distant lamps."""
+    """Write a matte bump of 32 x 32 pixels, 64 mm wide, without a mask or lights, under near or
+    distant lamps.
+    """
     x, y = square_grid(32, BUMP_MM / 2 * (1 - 1 / 32))
     heights = 8 * np.cos(x / 20) * np.cos(y / 25)
     slopes = 8 / 20 * np.sin(x / 20) * np.cos(y / 25), 8 / 25 * np.cos(x / 20) * np.sin(y / 25)
@@ -136,7 +168,9 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
     shading = np.clip((towards * normals).sum(axis=3) / distance, 0, None)
     pictures = shading * (1 if distant else 150.0**2 / distance**2)
     stored = np.rint(pictures * 30_000).astype(np.uint16)
-    return write_capture(folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1)
+    return write_capture(
+        folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1
+    )
 
 
 @dataclass(kw_only=True)
@@ -154,7 +188,9 @@ class Teacher(Estimator):
     def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
         return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
-    def estimate_with_error(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+    def estimate_with_error(
+        self, observations: Any, light_directions: Any, *, progress: Any = None
+    ) -> Any:
         """Return normals (P, 3) and the distributions (P, 2) of their errors."""
         raise NotImplementedError
 

@@ -13,7 +13,9 @@ MakeSet = Callable[..., PixelSet]
 THREE_SCENES = (("a", "one", 40, 30), ("b", "two", 30, 25), ("c", "three", 20, 12))
 
 
-def matte_pixels(pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = np.float32) -> Pixels:
+def matte_pixels(
+    pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = np.float32
+) -> Pixels:
     """Matte pixels of random albedo under random lights: albedo max(0, n . l)."""
     random = np.random.default_rng(seed)
 
@@ -26,7 +28,9 @@ def matte_pixels(pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = 
     albedo = random.uniform(0.2, 1.0, (pixels, 1))
     mask = np.zeros((pixels, 2), bool)
     mask[:, 0] = True
-    return Pixels((albedo * (normals @ directions.T).clip(0)).astype(dtype), normals, directions, mask)
+    return Pixels(
+        (albedo * (normals @ directions.T).clip(0)).astype(dtype), normals, directions, mask
+    )
 
 
 @pytest.fixture
@@ -40,7 +44,13 @@ def make_set(tmp_path: Path) -> MakeSet:
     ) -> PixelSet:
         writer = PixelSetWriter(tmp_path / name)
         for index, (entry, scene, pixels, lights) in enumerate(entries):
-            writer.add(entry, scene, "a test", {"by": "hand"}, matte_pixels(pixels, lights, seed=index, dtype=dtype))
+            writer.add(
+                entry,
+                scene,
+                "a test",
+                {"by": "hand"},
+                matte_pixels(pixels, lights, seed=index, dtype=dtype),
+            )
         return writer.finish()
 
     return make

@@ -43,15 +43,26 @@ def coarse_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def numbers(line: str) -> list[float]:
-    return [float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))]
+    return [
+        float(number)
+        for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))
+    ]
 
 
 SPEEDS = {
     "training_speed --batch-size 4 --steps 1 --warm-up 1 --device cpu": (
-        "compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps",
+        "compact",
+        "compact, Ls and La",
+        "compact, alternating",
+        "paper",
+        "cnn-ps",
     ),
-    "inference_speed --pixels 64 --repeats 1": ("layers of the paper", "spline-net-pixelwise", "spline-net-pixelwise"),
-}  # fmt: skip
+    "inference_speed --pixels 64 --repeats 1": (
+        "layers of the paper",
+        "spline-net-pixelwise",
+        "spline-net-pixelwise",
+    ),
+}
 
 
 @pytest.mark.parametrize("command", SPEEDS)
@@ -82,11 +93,24 @@ def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_faulty_captures_of_pixel_sets(run: Run, make_set: MakeSet, tmp_path: Path) -> None:
     folder = str(make_set(entries=[("a", "one", 400, 30)]).folder)
-    run("faulty_captures", str(tmp_path / "made"), "--scenes", "4", "--part", "2/2", "--sets", folder)
+    run(
+        "faulty_captures",
+        str(tmp_path / "made"),
+        "--scenes",
+        "4",
+        "--part",
+        "2/2",
+        "--sets",
+        folder,
+    )
     made = [dict(np.load(path)) for path in (tmp_path / "made").glob("*.npz")]
     assert len(made) >= 4
     assert len({int(each["scene"]) for each in made}) == 1
-    assert all(each["mask"].sum() == 400 == each["known"].sum() for each in made if each["kind"] != "no mask")
+    assert all(
+        each["mask"].sum() == 400 == each["known"].sum()
+        for each in made
+        if each["kind"] != "no mask"
+    )
 
 
 @pytest.mark.usefixtures("coarse_shapes")
@@ -102,7 +126,9 @@ def test_render_accuracy(run: Run) -> None:
 @pytest.mark.usefixtures("coarse_shapes")
 def test_near_lamps(run: Run) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run("near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8").splitlines()
+    printed = run(
+        "near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8"
+    ).splitlines()
     assert len(printed) == 8
     plane = next(row for row in printed if row.split()[:2] == ["matte", "plane"])
     distant, distant_range, as_distant, bowl, near, near_range, *_ = numbers(plane)
@@ -112,8 +138,13 @@ def test_near_lamps(run: Run) -> None:
 
 
 def test_inspection(run: Run) -> None:
-    printed = run("inspection", "--size", "96", "--plates", "1", "--depths", "0.5", "--method", "ls").splitlines()
-    assert printed[2:] == ["| dent | 0.5 | 4 of 4 | 4 of 4 |", "| scratch | 0.5 | 4 of 4 | 4 of 4 |"]
+    printed = run(
+        "inspection", "--size", "96", "--plates", "1", "--depths", "0.5", "--method", "ls"
+    ).splitlines()
+    assert printed[2:] == [
+        "| dent | 0.5 | 4 of 4 | 4 of 4 |",
+        "| scratch | 0.5 | 4 of 4 | 4 of 4 |",
+    ]
 
 
 def test_large_captures(run: Run, tmp_path: Path) -> None:
@@ -141,7 +172,11 @@ def test_gpu_session(tmp_path: Path) -> None:
     session.ends = time.time()
     assert session.step("late", module.normals_apart, one, other, seconds=60) is None
     report = (tmp_path / "report.txt").read_text()
-    assert report.count("FAILED") >= 2 and "FileNotFoundError" in report and "there is no time left" in report
+    assert (
+        report.count("FAILED") >= 2
+        and "FileNotFoundError" in report
+        and "there is no time left" in report
+    )
     steps = [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())]
     assert steps == ["apart", "missing", "late"]
 
@@ -153,7 +188,13 @@ def test_all_figures(run: Run, tmp_path: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(MEDALLION)
     stored = tmp_path / "figures.json"
-    places = (str(tmp_path / "data"), "--results", str(tmp_path / "results"), "--figures", str(stored))
+    places = (
+        str(tmp_path / "data"),
+        "--results",
+        str(tmp_path / "results"),
+        "--figures",
+        str(stored),
+    )
     arguments = (*places, "--trials", "2", "--only", "noise/ls")
     assert run("all_figures", *arguments).startswith("noise, ls: ")
     measured = json.loads(stored.read_text())["noise"]
@@ -166,7 +207,9 @@ def test_all_figures(run: Run, tmp_path: Path) -> None:
 
 def test_wrong_lights(run: Run) -> None:
     rows = run("wrong_lights", MEDALLION, "--scenes", "0", "--draws", "1").splitlines()
-    cells = dict(row.strip("| ").split(" | ") for row in rows if row.count("|") == 3 and "---" not in row)
+    cells = dict(
+        row.strip("| ").split(" | ") for row in rows if row.count("|") == 3 and "---" not in row
+    )
     assert cells.pop("light file") == "medallion"
     assert cells.pop("right") == "0 of 1"
     assert len(cells) == 9
@@ -174,7 +217,9 @@ def test_wrong_lights(run: Run) -> None:
 
 
 def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
-    """Trained weights are better on measured materials than a network without training, which is a Lambertian fit."""
+    """Trained weights are better on measured materials than a network without training, which is a
+    Lambertian fit.
+    """
     lights = shared_data / "DiLiGenT/pmsData/ballPNG/light_directions.txt"
     materials = shared_data / "merl_nbrdf/merl_nbrdf.npz"
     untrained = tmp_path / "untrained.safetensors"
@@ -188,10 +233,19 @@ def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
 
 def test_measured_materials_are_those_of_explicit_vectors(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
-    shapes = {"W1": (3, 6, 5), "b1": (3, 5), "W2": (3, 5, 4), "b2": (3, 4), "W3": (3, 4, 3), "b3": (3, 3)}
+    shapes = {
+        "W1": (3, 6, 5),
+        "b1": (3, 5),
+        "W2": (3, 5, 4),
+        "b2": (3, 4),
+        "W3": (3, 4, 3),
+        "b3": (3, 3),
+    }
     arrays = {key: random.normal(0.2, 0.3, shape) for key, shape in shapes.items()}
     np.savez(tmp_path / "materials.npz", names=["first", "brass", "third"], **arrays)
-    materials = importlib.import_module("measured_spheres").read_materials(tmp_path / "materials.npz")
+    materials = importlib.import_module("measured_spheres").read_materials(
+        tmp_path / "materials.npz"
+    )
     assert materials.names == ["first", "third"]  # not the implausible one
     normals, lights = (random.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
     normals, lights = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normals, lights))
@@ -205,21 +259,26 @@ def test_measured_materials_are_those_of_explicit_vectors(tmp_path: Path) -> Non
 
 
 def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
-    """The gray BRDF by Rusinkiewicz's definition, with rotations of explicit vectors, in float64."""
+    """The gray BRDF by Rusinkiewicz's definition, with rotations of explicit vectors,
+    in float64.
+    """
     view = np.array((0.0, 0.0, 1.0))
     if light @ n < view @ n:
         light, view = view, light
     half = (light + view) / np.linalg.norm(light + view)
     tangent = half - (half @ n) * n
     tangent /= np.linalg.norm(tangent)
-    frame = np.stack((tangent, np.cross(n, tangent), n))  # the normal along z, the half vector at azimuth zero
+    # the normal along z, the half vector at azimuth zero
+    frame = np.stack((tangent, np.cross(n, tangent), n))
     half, light = frame @ half, frame @ light
     cosine, sine = half[2], math.sqrt(1 - half[2] ** 2)
     difference = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ light
     value = np.concatenate((half, (difference[0], abs(difference[1]), difference[2])))
     for layer in (1, 2):
         value = np.maximum(value @ arrays[f"W{layer}"][material] + arrays[f"b{layer}"][material], 0)
-    return float(np.maximum(np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1, 0).mean())
+    return float(
+        np.maximum(np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1, 0).mean()
+    )
 
 
 @pytest.mark.usefixtures("coarse_shapes")

@@ -57,8 +57,14 @@ def test_every_page_is_in_the_site():
     """mkdocs.yml lists each page of the documentation and each command once, and nothing else."""
     names = [by_name(page).removeprefix("docs/") for page in PAGES if page.name != "README.md"]
     group: Any = typer.main.get_command(app)
-    names += ["index.md", "examples/README.md", *(f"commands/{command}.md" for command in group.commands)]
-    assert sorted(re.findall(r"^ +- .*: (\S+\.md)$", text_of("mkdocs.yml"), re.MULTILINE)) == sorted(names)
+    names += [
+        "index.md",
+        "examples/README.md",
+        *(f"commands/{command}.md" for command in group.commands),
+    ]
+    assert sorted(
+        re.findall(r"^ +- .*: (\S+\.md)$", text_of("mkdocs.yml"), re.MULTILINE)
+    ) == sorted(names)
 
 
 def test_pages_are_short():
@@ -69,7 +75,9 @@ def test_pages_are_short():
 
 
 def commands() -> Iterator[tuple[str, str]]:
-    """Page and command line of every splinecli command in the code blocks and tables of the documentation."""
+    """Page and command line of every splinecli command in the code blocks and tables of the
+    documentation.
+    """
     for page in PAGES:
         text = page.read_text("utf-8").replace("\\\n", " ")
         blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
@@ -91,8 +99,13 @@ def test_commands_have_options_that_exist(page, command):
     if words[0].startswith("-"):
         known = group.params
     else:
-        known = [*group.commands[words[0]].params, *(group.commands["infer"].params if "--" in words else ())]
-    options = {option for parameter in known for option in (*parameter.opts, *parameter.secondary_opts)}
+        known = [
+            *group.commands[words[0]].params,
+            *(group.commands["infer"].params if "--" in words else ()),
+        ]
+    options = {
+        option for parameter in known for option in (*parameter.opts, *parameter.secondary_opts)
+    }
     options |= {"--help", "-h", "--install-completion", "--show-completion", "--version"}
     for word in words:
         if re.match(r"--?[a-z]", word):
@@ -102,7 +115,12 @@ def test_commands_have_options_that_exist(page, command):
 def test_exit_codes():
     codes = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text_of("docs/warnings.md"), re.MULTILINE))
     assert codes.keys() == {"0", "1", "2", "3", "4", "5", "130"}
-    for error, word in ((UsageError, "usage"), (InputError, "input"), (ModelError, "weights"), (OutputError, "output")):
+    for error, word in (
+        (UsageError, "usage"),
+        (InputError, "input"),
+        (ModelError, "weights"),
+        (OutputError, "output"),
+    ):
         assert word in codes[str(error.exit_code)]
 
 
@@ -127,15 +145,23 @@ def test_python_page(tmp_path, monkeypatch):
 
 
 def test_examples_of_docstrings(tmp_path, monkeypatch):
-    """Each function of the Python pages has an example, and all examples of the package print what they show."""
+    """Each function of the Python pages has an example, and all examples of the package print what
+    they show.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
-    imports = re.findall(r"^from (splinecli\S*) import ([a-z]\w*)$", text_of("docs/python.md"), re.MULTILINE)
-    documented = {".".join(names) for names in imports} | {f"splinecli.{name}" for name in splinecli.__all__[1:]}
+    imports = re.findall(
+        r"^from (splinecli\S*) import ([a-z]\w*)$", text_of("docs/python.md"), re.MULTILINE
+    )
+    documented = {".".join(names) for names in imports} | {
+        f"splinecli.{name}" for name in splinecli.__all__[1:]
+    }
     assert [name for name in sorted(documented) if ">>>" not in resolve_name(name).__doc__] == []
     sources = (path for path in PACKAGE.rglob("*.py") if ">>> " in path.read_text("utf-8"))
     modules = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in sources]
-    results = {name: doctest.testmod(resolve_name(name.removesuffix(".__init__"))) for name in modules}
+    results = {
+        name: doctest.testmod(resolve_name(name.removesuffix(".__init__"))) for name in modules
+    }
     assert {name: result.failed for name, result in results.items() if result.failed} == {}
 
 
@@ -158,7 +184,9 @@ def test_places_of_the_contributing_page():
 
 @pytest.mark.parametrize("name", figure_tables.PAGES)
 def test_tables_of_figures(name):
-    """Each table says what docs/figures.json says. `python benchmarks/figure_tables.py` writes them."""
+    """Each table says what docs/figures.json says. `python benchmarks/figure_tables.py` writes
+    them.
+    """
     measured = json.loads(figure_tables.FIGURES.read_text("utf-8"))
     text = text_of(name)
     assert text == figure_tables.fill(text, measured, figure_tables.shipped_weights())
@@ -166,25 +194,38 @@ def test_tables_of_figures(name):
 
 
 def test_every_table_of_figures_is_shown():
-    shown = [found for name in figure_tables.PAGES for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))]
+    shown = [
+        found
+        for name in figure_tables.PAGES
+        for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))
+    ]
     assert sorted(shown) == sorted(figure_tables.TABLES)
 
 
 def test_plots_of_figures(tmp_path):
     """The plots have a curve or a bar for each method that they name."""
     figure_plots.main(tmp_path)
-    for name, methods in (("accuracy_lights.svg", figure_plots.COLOURS), ("accuracy_published.svg", ("PX-Net", "LS"))):
+    for name, methods in (
+        ("accuracy_lights.svg", figure_plots.COLOURS),
+        ("accuracy_published.svg", ("PX-Net", "LS")),
+    ):
         drawn = (tmp_path / name).read_text("utf-8")
         assert all(f">{method}</text>" in drawn for method in methods)
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in DOCS.glob("pictures/accuracy_*.svg")}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        path.name for path in DOCS.glob("pictures/accuracy_*.svg")
+    }
 
 
 def test_figures_of_other_weights_are_marked():
     """New weights never leave old figures unmarked."""
     rows = {row: dict.fromkeys(("4", "10"), 1.0) for row in ("ls",)}
-    table = figure_tables.Table(("lights",), "method", {"least squares": "ls"}, {"4": "4", "10": "10", "20": "20"})
+    table = figure_tables.Table(
+        ("lights",), "method", {"least squares": "ls"}, {"4": "4", "10": "10", "20": "20"}
+    )
     measured = {"lights": {"version": "0.2.0", "weights": "old", "machine": "", "rows": rows}}
     shown = table.text(measured, "old").splitlines()[2:]
     assert shown == ["| least squares | 1.00 | 1.00 | - |", "", "(version 0.2.0, weights old)"]
-    assert table.text(measured, "new").endswith("(**not measured with these weights**: version 0.2.0, weights old)")
+    assert table.text(measured, "new").endswith(
+        "(**not measured with these weights**: version 0.2.0, weights old)"
+    )
     assert table.text({}, "new") == "(not measured with these weights)"

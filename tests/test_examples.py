@@ -25,7 +25,8 @@ from splinecli.maths.normals import angle_between_deg, encode_picture, unit
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MEDALLION = EXAMPLES / "medallion"
 TUTORIAL = EXAMPLES.parent / "docs/tutorial.md"
-ONE_COUNT = 1  # of 65535: libraries of mathematics differ in the last digit, and rounding then in one count
+# of 65535: libraries of mathematics differ in the last digit, and rounding then in one count
+ONE_COUNT = 1
 
 
 def read_png(path: Path) -> Any:
@@ -53,11 +54,17 @@ def test_the_stored_balls_are_what_the_script_renders(script):
 
 
 def test_the_tutorial(tmp_path, monkeypatch, capfd):
-    """Run its commands in order: they lead from photographs to a mesh and print what the tutorial shows."""
+    """Run its commands in order: they lead from photographs to a mesh and print what the tutorial
+    shows.
+    """
     text = TUTORIAL.read_text("utf-8")
     (tmp_path / "examples").symlink_to(EXAMPLES)
     monkeypatch.chdir(tmp_path)
-    commands = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    commands = [
+        line
+        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+        for line in block.splitlines()
+    ]
     assert len(commands) <= 6
     said = ""
     for command in commands:
@@ -69,7 +76,10 @@ def test_the_tutorial(tmp_path, monkeypatch, capfd):
         assert code == 0, (command, err)
         said += " ".join((out + err).split()) + " "
     # The expected memory and time differ from machine to machine.
-    shown = [block.partition("    expect ")[0] for block in re.findall(r"(?:^ {4}.+\n)+", text, re.MULTILINE)]
+    shown = [
+        block.partition("    expect ")[0]
+        for block in re.findall(r"(?:^ {4}.+\n)+", text, re.MULTILINE)
+    ]
     assert len(shown) == 3
     for block in shown:
         assert re.sub(r", [\d.]+ s$", "", " ".join(block.split())) in said
@@ -95,7 +105,9 @@ def test_the_stored_capture_is_what_the_script_renders(script):
     assert counts_apart(stored, encode_picture(rendering.normals, rendering.mask)) <= ONE_COUNT
     directions = np.loadtxt(MEDALLION / "light_directions.txt")
     np.testing.assert_allclose(directions, rendering.light_directions, rtol=0, atol=1.1e-6)
-    np.testing.assert_array_equal(np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities)
+    np.testing.assert_array_equal(
+        np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities
+    )
 
 
 def test_nothing_is_saturated_and_nothing_is_warned_about():
@@ -104,8 +116,9 @@ def test_nothing_is_saturated_and_nothing_is_warned_about():
 
 
 def test_the_normals_belong_to_the_height_field(script):
-    # Independent of normals_of: heights one sample apart, walked over with the normals between them. The trapezium rule
-    # errs with the third derivative: small where the relief is smooth, which most of it is. Row 0 is the top.
+    # Independent of normals_of: heights one sample apart, walked over with the normals between
+    # them. The trapezium rule errs with the third derivative: small where the relief is smooth,
+    # which most of it is. Row 0 is the top.
     x, y = script.sample_grid()
     z, normals, spacing = script.height(x, y), script.normals_of(x, y), x[0, 1] - x[0, 0]
     for axis, sign in ((1, 1), (0, -1)):
@@ -117,7 +130,8 @@ def test_the_normals_belong_to_the_height_field(script):
 
 def test_python_api_runs_from_any_folder(tmp_path, monkeypatch, capsys):
     ls_mae_deg = estimate_normals(read_capture(MEDALLION), make_estimator("ls")).errors.mean
-    # 5.98 degrees. Another frame or order of the lights would give tens of degrees, a matte disc next to none.
+    # 5.98 degrees. Another frame or order of the lights would give tens of degrees, a matte disc
+    # next to none.
     assert 5 < ls_mae_deg < 7
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["python_api.py"])
@@ -137,7 +151,9 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
         pytest.skip("no splinecli console script, or no sh, on the PATH")
     call = [shell, str(EXAMPLES / "infer_medallion.sh"), "here"]
     programs = {"SPLINECLI": command, "PYTHON": sys.executable}
-    done = subprocess.run(call, cwd=tmp_path, env={**os.environ, **programs}, capture_output=True, text=True)
+    done = subprocess.run(
+        call, cwd=tmp_path, env={**os.environ, **programs}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("spline-net, 10 lights: MAE ")
     made = {path.name for path in (tmp_path / "here" / "medallion").iterdir()}
@@ -145,13 +161,20 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
 
 
 def test_the_overview_is_what_the_script_draws(tmp_path, monkeypatch):
-    """The README's picture matches the results of today; fonts and rounding differ a little between machines."""
+    """The README's picture matches the results of today; fonts and rounding differ a little between
+    machines.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["make_overview.py", "overview.png"])
     # The command of the script, in this process.
-    monkeypatch.setattr(subprocess, "run", lambda command, check: main(command[command.index("infer") :]))
+    monkeypatch.setattr(
+        subprocess, "run", lambda command, check: main(command[command.index("infer") :])
+    )
     runpy.run_path(str(EXAMPLES / "make_overview.py"), run_name="__main__")
-    drawn, stored = read_png(tmp_path / "overview.png"), read_png(TUTORIAL.parent / "pictures/overview.png")
+    drawn, stored = (
+        read_png(tmp_path / "overview.png"),
+        read_png(TUTORIAL.parent / "pictures/overview.png"),
+    )
     assert drawn.shape == stored.shape == (400, 1200, 3)
     assert (TUTORIAL.parent / "pictures/overview.png").stat().st_size < 400_000
     difference = np.abs(drawn.astype(int) - stored)

@@ -1,4 +1,6 @@
-"""Imports only point downwards through the rooms of the house, as the table of CONTRIBUTING.md ranks them."""
+"""Imports only point downwards through the rooms of the house, as the table of CONTRIBUTING.md
+ranks them.
+"""
 
 import ast
 import re
@@ -21,7 +23,9 @@ def imported_rooms(tree: ast.AST) -> set[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("splinecli"):
             modules += (
-                [f"{node.module}.{alias.name}" for alias in node.names] if node.module == "splinecli" else [node.module]
+                [f"{node.module}.{alias.name}" for alias in node.names]
+                if node.module == "splinecli"
+                else [node.module]
             )
         elif isinstance(node, ast.Import):
             modules += [alias.name for alias in node.names if alias.name.startswith("splinecli")]
@@ -30,7 +34,11 @@ def imported_rooms(tree: ast.AST) -> set[str]:
 
 
 def test_every_room_is_ranked():
-    names = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    names = {
+        path.stem
+        for path in SOURCE.iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
     assert names == set(HEIGHT)
 
 
@@ -47,13 +55,21 @@ def test_imports_point_downwards():
 def test_no_circles():
     """Modules do not import each other in circles, neither inside functions nor for types alone."""
     modules = {
-        ".".join(["splinecli", *path.relative_to(SOURCE).with_suffix("").parts]): path for path in SOURCE.rglob("*.py")
+        ".".join(["splinecli", *path.relative_to(SOURCE).with_suffix("").parts]): path
+        for path in SOURCE.rglob("*.py")
     }
     imports = {}
     for module, path in modules.items():
-        if path.stem in ("__init__", "__main__"):  # doors: nothing inside the house needs them to be imported first
+        if path.stem in (
+            "__init__",
+            "__main__",
+        ):  # doors: nothing inside the house needs them to be imported first
             continue
-        nodes = [node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.ImportFrom)]
+        nodes = [
+            node
+            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            if isinstance(node, ast.ImportFrom)
+        ]
         named = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names} | {
             node.module for node in nodes
         }

@@ -1,4 +1,6 @@
-"""Near lamps and near cameras: analytic surfaces under points of light, by the inverse square of the distance."""
+"""Near lamps and near cameras: analytic surfaces under points of light, by the inverse square of
+the distance.
+"""
 
 from dataclasses import replace
 
@@ -25,7 +27,9 @@ MATRIX = np.array([(60.0, 0, 20.5), (0, 60.0, 18.0), (0, 0, 1)])
 
 
 def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and the mask."""
+    """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and
+    the mask.
+    """
     place = (np.arange(side) + 0.5) * 2 / side - 1
     x, y = np.meshgrid(place, -place)
     mask = np.ones(x.shape, np.bool_)
@@ -51,7 +55,9 @@ def capture_of(
     truth = np.zeros((*mask.shape, 3), np.float32)
     truth[mask] = normals
     observations = (0.6 * shading * strengths / distance**2).astype(np.float32)
-    return Capture("scene", observations, unit(positions), tuple(range(len(positions))), mask, truth)
+    return Capture(
+        "scene", observations, unit(positions), tuple(range(len(positions))), mask, truth
+    )
 
 
 def near(kind: str, distance: float, side: int = SIDE) -> Capture:
@@ -66,7 +72,9 @@ def error_deg(capture: Capture) -> float:
 
 @pytest.mark.parametrize(("kind", "limit_deg"), [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
 def test_lamps_at_two_widths(kind: str, limit_deg: float) -> None:
-    """Exact data give exact normals, apart from the integration, whose error is that of a grid of 40 x 40 pixels."""
+    """Exact data give exact normals, apart from the integration, whose error is that of a grid of
+    40 x 40 pixels.
+    """
     capture = near(kind, 4.0)
     assert error_deg(capture) < limit_deg
     assert error_deg(replace(capture, lamps=None)) > 10
@@ -83,7 +91,9 @@ def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
 
 
 def test_intensities_hold_at_the_origin() -> None:
-    """Lamps of unequal distances: as of equal lamps, or with the intensities that a gray card at the origin shows."""
+    """Lamps of unequal distances: as of equal lamps, or with the intensities that a gray card at
+    the origin shows.
+    """
     distances = np.linspace(3, 6, 10)
     positions = LIGHTS * distances[:, None]
     capture = capture_of(*surface("dome"), positions, np.ones(10))
@@ -96,7 +106,9 @@ def test_intensities_hold_at_the_origin() -> None:
 
 @pytest.mark.parametrize("equal", [True, False])
 def test_lamps_that_shine_in_lobes(equal: bool) -> None:
-    """LEDs that miss the middle of the object by up to 30 degrees, of equal power or measured at the origin."""
+    """LEDs that miss the middle of the object by up to 30 degrees, of equal power or measured at
+    the origin.
+    """
     points, normals, mask = surface("dome")
     positions = LIGHTS * np.linspace(3, 6, 10)[:, None]
     axes = unit(0.4 * np.random.default_rng(0).normal(size=(10, 3)) - LIGHTS)
@@ -135,7 +147,9 @@ def test_a_perspective_camera() -> None:
 
 
 def glossy_sphere(half_angle_deg: float, *, gloss: float = 1.0, side: int = 32) -> Capture:
-    """A sphere that fills the picture of a pinhole camera, under distant lights: Lambert's law and Blinn-Phong's."""
+    """A sphere that fills the picture of a pinhole camera, under distant lights: Lambert's law and
+    Blinn-Phong's.
+    """
     focal, middle = side / 2 / np.tan(np.radians(half_angle_deg)), (side - 1) / 2
     matrix = np.array([(focal, 0, middle), (0, focal, middle), (0, 0, 1)])
     rays = unit(pixel_rays(np.ones((side, side), np.bool_), matrix))
@@ -155,7 +169,9 @@ def glossy_sphere(half_angle_deg: float, *, gloss: float = 1.0, side: int = 32) 
 
 
 def test_the_shipped_network_sees_gloss_from_a_near_camera() -> None:
-    """Refined, too: without the camera, the highlights are where an orthographic one would not see them."""
+    """Refined, too: without the camera, the highlights are where an orthographic one would not see
+    them.
+    """
     capture, estimator = glossy_sphere(20, side=20), make_estimator("spline-net")
     found = estimate_normals(capture, estimator)
     without = estimate_normals(replace(capture, camera_matrix=None), estimator)
@@ -165,7 +181,10 @@ def test_the_shipped_network_sees_gloss_from_a_near_camera() -> None:
 
 def test_least_squares_does_not_depend_on_the_camera() -> None:
     capture, estimator = glossy_sphere(20), make_estimator("ls")
-    maps = [estimate_normals(each, estimator).normal_map for each in (capture, replace(capture, camera_matrix=None))]
+    maps = [
+        estimate_normals(each, estimator).normal_map
+        for each in (capture, replace(capture, camera_matrix=None))
+    ]
     np.testing.assert_allclose(*maps, atol=1e-4)
     matte = estimate_normals(glossy_sphere(20, gloss=0), make_estimator("iw12"))
     assert matte.errors.median < 0.1  # shadows at the rim
@@ -174,7 +193,10 @@ def test_least_squares_does_not_depend_on_the_camera() -> None:
 def test_a_camera_far_away_is_orthographic() -> None:
     """At this focal length, rays differ by 0.002 degrees."""
     capture, estimator = glossy_sphere(0.001, side=20), make_estimator("spline-net-pixelwise")
-    maps = [estimate_normals(each, estimator).normal_map for each in (capture, replace(capture, camera_matrix=None))]
+    maps = [
+        estimate_normals(each, estimator).normal_map
+        for each in (capture, replace(capture, camera_matrix=None))
+    ]
     np.testing.assert_allclose(*maps, atol=2e-3)
 
 
@@ -187,17 +209,26 @@ def images_of(capture: Capture) -> NDArray[np.float32]:
 def test_the_python_door_takes_a_camera() -> None:
     capture = glossy_sphere(20, side=16)
     arguments = images_of(capture), LIGHTS, capture.mask
-    found = splinecli.estimate_normals(*arguments, camera_matrix=capture.camera_matrix, method="st14")
+    found = splinecli.estimate_normals(
+        *arguments, camera_matrix=capture.camera_matrix, method="st14"
+    )
     expected = estimate_normals(capture, make_estimator("st14")).normal_map
     np.testing.assert_allclose(found.normal_map, expected, atol=1e-5)
-    assert np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max() > 0.01
+    assert (
+        np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max()
+        > 0.01
+    )
     for matrix, error in ((np.eye(2), UsageError), (-np.eye(3), InputError)):
         with pytest.raises(error, match="camera matrix"):
             splinecli.estimate_normals(*arguments, camera_matrix=matrix, method="ls")
 
 
-@pytest.mark.parametrize(("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)])
-def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, limit_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)]
+)
+def test_a_part_of_the_images(
+    kind: str, box: tuple[int, int, int, int] | None, limit_deg: float
+) -> None:
     """Every second row and column, and a box that lies off the middle of the images."""
     capture = near(kind, 4.0, side=2 * SIDE)
     window = Window(box, 2, capture.mask.shape)
@@ -205,7 +236,9 @@ def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, 
     mask = window.of(capture.mask)
     rows = (window.whole(mask) & capture.mask)[capture.mask]
     truth, lamps = window.of(capture.ground_truth), capture.lamps.within(left, top, 2, None)
-    part = replace(capture, observations=capture.observations[rows], mask=mask, ground_truth=truth, lamps=lamps)
+    part = replace(
+        capture, observations=capture.observations[rows], mask=mask, ground_truth=truth, lamps=lamps
+    )
     assert error_deg(part) < limit_deg
 
 

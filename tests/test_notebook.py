@@ -21,10 +21,22 @@ LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]]
 
 
 def read_medallion(folder: Path = MEDALLION) -> tuple[NDArray[Any], ...]:
-    """Images (F, H, W, 3), light directions (F, 3), intensities (F, 3) and mask (H, W), as a notebook reads them."""
-    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] for path in sorted(folder.glob("[01]*.png"))]
-    directions, intensities = (np.loadtxt(folder / f"light_{name}.txt") for name in ("directions", "intensities"))
-    return np.stack(images), directions, intensities, cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    """Images (F, H, W, 3), light directions (F, 3), intensities (F, 3) and mask (H, W), as a
+    notebook reads them.
+    """
+    images = [
+        cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1]
+        for path in sorted(folder.glob("[01]*.png"))
+    ]
+    directions, intensities = (
+        np.loadtxt(folder / f"light_{name}.txt") for name in ("directions", "intensities")
+    )
+    return (
+        np.stack(images),
+        directions,
+        intensities,
+        cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0,
+    )
 
 
 def matte(dtype: type = np.float64, scale: float = 1.0) -> tuple[NDArray[Any], NDArray[np.float64]]:
@@ -48,7 +60,11 @@ def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Pa
     assert main(["infer", str(folder), *options]) == 0
     expected = np.load(tmp_path / "out/medallion/normals.npy")
     estimate = splinecli.estimate_normals(
-        images, directions, mask, light_intensities=intensities if intensities_known else None, method="iw12"
+        images,
+        directions,
+        mask,
+        light_intensities=intensities if intensities_known else None,
+        method="iw12",
     )
     assert (estimate.capture.estimated_intensities is None) == intensities_known
     assert estimate.normal_map.tobytes() == expected.tobytes()
@@ -61,29 +77,49 @@ def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
     small = np.zeros_like(mask)
     small[80:110, 80:110] = mask[80:110, 80:110]
     assert cv2.imwrite(str(tmp_path / "mask.png"), small * np.uint8(255))
-    options = ["--light-indices", "0,3,6", "--mask", str(tmp_path / "mask.png"), "-q", "-o", str(tmp_path)]
+    options = [
+        "--light-indices",
+        "0,3,6",
+        "--mask",
+        str(tmp_path / "mask.png"),
+        "-q",
+        "-o",
+        str(tmp_path),
+    ]
     assert main(["infer", str(MEDALLION), *options]) == 0
     chosen, done = [0, 3, 6], []
     estimate = splinecli.estimate_normals(
-        images[chosen], directions[chosen], small, light_intensities=intensities[chosen], progress=done.append
+        images[chosen],
+        directions[chosen],
+        small,
+        light_intensities=intensities[chosen],
+        progress=done.append,
     )
     assert sum(done) == small.sum() > 0
     told = json.loads((tmp_path / "medallion/report.json").read_text())["warnings"]
-    assert [warning.code for warning in estimate.capture.warnings] == [warning["code"] for warning in told]
+    assert [warning.code for warning in estimate.capture.warnings] == [
+        warning["code"] for warning in told
+    ]
     assert "untrained_lights" in [warning["code"] for warning in told]
 
 
 @pytest.mark.parametrize(
-    ("dtype", "scale"), [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)]
+    ("dtype", "scale"),
+    [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)],
 )
 def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
     images, normals = matte(dtype, scale)
-    estimate = splinecli.estimate_normals(images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS)))
+    estimate = splinecli.estimate_normals(
+        images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS))
+    )
     # 8 bits round by up to 0.25 %.
-    np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-2 if dtype is np.uint8 else 1e-4)
+    np.testing.assert_allclose(
+        estimate.normal_map, normals, atol=1e-2 if dtype is np.uint8 else 1e-4
+    )
 
 
-@pytest.mark.filterwarnings("ignore:The images fit the lights much better if")  # clipped ones, as stored
+# clipped ones, as stored
+@pytest.mark.filterwarnings("ignore:The images fit the lights much better if")
 def test_saturated_values_are_restored_unless_as_stored() -> None:
     lights = np.concatenate((LIGHTS, LIGHTS[1:] * (-1, -1, 1)))
     _, normals = matte()
@@ -93,7 +129,9 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
 
     def worst(images: NDArray[Any], **options: Any) -> float:
         known = np.ones(len(lights))
-        estimate = splinecli.estimate_normals(images, lights, light_intensities=known, method="ls", **options)
+        estimate = splinecli.estimate_normals(
+            images, lights, light_intensities=known, method="ls", **options
+        )
         return float(np.abs(estimate.normal_map - normals).max())
 
     stored, restored = worst(clipped, as_stored=True), worst(clipped)
@@ -115,16 +153,32 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
         ({"images": []}, UsageError, "found no images"),
         ({"images": [np.ones((5, 6)), np.ones((5, 7))]}, UsageError, "images[1]"),
         ({"images": -np.ones((4, 5, 6))}, InputError, "images[0]: found the negative value -1"),
-        ({"light_directions": LIGHTS[:3]}, UsageError, "expected (F, 3) = (4, 3), one for each image"),
-        ({"light_directions": -LIGHTS}, InputError, "light_directions: found a light below the horizon in row 0"),
-        ({"mask": np.ones((5, 5))}, UsageError, "found a mask of shape (5, 5), expected (H, W) = (5, 6)"),
+        (
+            {"light_directions": LIGHTS[:3]},
+            UsageError,
+            "expected (F, 3) = (4, 3), one for each image",
+        ),
+        (
+            {"light_directions": -LIGHTS},
+            InputError,
+            "light_directions: found a light below the horizon in row 0",
+        ),
+        (
+            {"mask": np.ones((5, 5))},
+            UsageError,
+            "found a mask of shape (5, 5), expected (H, W) = (5, 6)",
+        ),
         ({"mask": np.zeros((5, 6))}, InputError, "the mask is empty"),
         ({"light_intensities": np.ones(3)}, UsageError, "found light intensities of shape (3,)"),
         ({"light_intensities": np.zeros(4)}, InputError, "not a finite number above 0"),
     ],
 )
 def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message: str) -> None:
-    arguments: dict[str, Any] = {"images": np.ones((4, 5, 6)), "light_directions": LIGHTS, "method": "ls"}
+    arguments: dict[str, Any] = {
+        "images": np.ones((4, 5, 6)),
+        "light_directions": LIGHTS,
+        "method": "ls",
+    }
     with pytest.raises(error) as caught:
         splinecli.estimate_normals(**(arguments | change))
     assert message in str(caught.value)
@@ -146,7 +200,9 @@ def test_the_capture_has_a_mask_of_its_own() -> None:
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
-    """A gray edge at or below half of the largest value is outside; any value of a bool mask that is True counts."""
+    """A gray edge at or below half of the largest value is outside; any value of a bool mask that
+    is True counts.
+    """
     generator = np.random.default_rng(0)
     images = generator.uniform(0.1, 1, (4, 2, 3))
     directions = [(0.1, 0, 1), (0, 0.4, 1), (-0.5, 0, 1), (0, -0.6, 1)]

@@ -1,4 +1,6 @@
-"""Methods, maps and warnings are rows of tables: one row adds one everywhere, and nothing tests for it by name."""
+"""Methods, maps and warnings are rows of tables: one row adds one everywhere, and nothing tests for
+it by name.
+"""
 
 import re
 from pathlib import Path
@@ -46,8 +48,12 @@ def test_tables_of_the_documentation(name: str) -> None:
 
 def test_no_method_is_known_by_its_name_or_has_hidden_hooks() -> None:
     names = "|".join(METHODS)
-    by_name = re.compile(rf"""(?<!grid) [!=]= "(?:{names})"|startswith\("(?:spline|cnn)|(?:get|has)attr\(estimator""")
-    assert [path.name for path in SOURCE.rglob("*.py") if by_name.search(path.read_text("utf-8"))] == []
+    by_name = re.compile(
+        rf"""(?<!grid) [!=]= "(?:{names})"|startswith\("(?:spline|cnn)|(?:get|has)attr\(estimator"""
+    )
+    assert [
+        path.name for path in SOURCE.rglob("*.py") if by_name.search(path.read_text("utf-8"))
+    ] == []
 
 
 class Flat(Estimator):
@@ -63,7 +69,9 @@ class Flat(Estimator):
 
 
 def test_a_method_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "flat", Method(lambda name, options: Flat(), "a constant", "nobody"))
+    monkeypatch.setitem(
+        METHODS, "flat", Method(lambda name, options: Flat(), "a constant", "nobody")
+    )
     assert method_names()[-1] == "flat"
     assert "| `flat` | a constant | nobody |" in make_tables.methods_table()
     estimate = estimate_normals(capture(), make_estimator("flat"))
@@ -72,12 +80,21 @@ def test_a_method_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    uniform = WarningKind("uniform", "All values are equal", "Photograph an object", severity="error")
+    uniform = WarningKind(
+        "uniform", "All values are equal", "Photograph an object", severity="error"
+    )
     monkeypatch.setitem(WARNINGS, uniform.code, uniform)
-    assert "| `uniform` | All values are equal | Photograph an object | error |" in make_tables.warnings_table()
+    assert (
+        "| `uniform` | All values are equal | Photograph an object | error |"
+        in make_tables.warnings_table()
+    )
 
     def check(seen: checks.CaptureSample) -> list[CaptureWarning]:
-        return [CaptureWarning(uniform, "All values are equal.")] if np.ptp(seen.observations) == 0 else []
+        return (
+            [CaptureWarning(uniform, "All values are equal.")]
+            if np.ptp(seen.observations) == 0
+            else []
+        )
 
     monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(check)])
     warnings = checks.check_arrays(capture())
@@ -104,15 +121,26 @@ def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row in chosen_maps([], page=True)
     values = make_map(row, None, estimate)  # type: ignore[arg-type]
     assert dict(map_files(row, values, mask, ["npy"])).keys() == {"slant.npy", "slant.png"}
-    assert dict(map_files(row, values, mask, ["tiff"])).keys() == {"slant.npy", "slant.tiff", "slant.png"}
-    assert {"slant.npy", "slant.tiff", "slant.png"} <= set(own_files())  # so that it is no photograph
-    assert "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera axis |" in (
-        make_tables.maps_table()
+    assert dict(map_files(row, values, mask, ["tiff"])).keys() == {
+        "slant.npy",
+        "slant.tiff",
+        "slant.png",
+    }
+    # so that it is no photograph
+    assert {"slant.npy", "slant.tiff", "slant.png"} <= set(own_files())
+    assert (
+        "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera"
+        " axis |" in (make_tables.maps_table())
     )
     assert results_bytes(100, 4, maps=["slant"]) - results_bytes(100, 4) == 700
     page = result_page(REPORT, estimate.normal_map, mask, values={"slant": values})
     assert "<figcaption>Slant</figcaption>" in page
-    given = typer.main.get_command(app).commands["infer"].make_context("infer", ["x", "--maps", "slant:0.5"]).params
+    given = (
+        typer.main.get_command(app)
+        .commands["infer"]
+        .make_context("infer", ["x", "--maps", "slant:0.5"])
+        .params
+    )
     assert InferOptions.from_arguments(given).map_scales == (("slant", 0.5),)
 
 
@@ -123,4 +151,6 @@ def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray
 @pytest.mark.parametrize("row", MAPS.values(), ids=list(MAPS))
 def test_functions_of_the_maps_exist(row: OutputMap) -> None:
     assert {row.name, *(part.name for part in row.parts)} <= MAP_FUNCTIONS.keys()
-    assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == ("npy",)
+    assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == (
+        "npy",
+    )

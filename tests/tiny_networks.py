@@ -11,7 +11,9 @@ TINY: dict[str, Any] = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width"
 
 
 def random_network(**settings: Any) -> SplineNet:
-    """Make a network all of whose layers are random: the last ones start at zero, where every symmetry holds."""
+    """Make a network all of whose layers are random: the last ones start at zero, where every
+    symmetry holds.
+    """
     with torch.random.fork_rng():
         torch.manual_seed(0)
         network = SplineNet(NetworkConfig.from_dict(TINY | settings)).eval()

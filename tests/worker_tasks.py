@@ -1,4 +1,6 @@
-"""Items for workers in other processes, which import this file. They note in a folder what happens."""
+"""Items for workers in other processes, which import this file.
+They note in a folder what happens.
+"""
 
 import os
 import signal

@@ -1,7 +1,8 @@
-"""splinecli: surface normals from a few photographs under known lights (photometric stereo, SPLINE-Net).
+"""splinecli: surface normals from a few photographs under known lights (photometric stereo,
+SPLINE-Net).
 
-Use `estimate_normals` and `integrate_normals` on arrays, for example in a notebook. To work with folders of files, use
-the command line or the functions in docs/python.md.
+Use `estimate_normals` and `integrate_normals` on arrays, for example in a notebook. To work with
+folders of files, use the command line or the functions in docs/python.md.
 """
 
 from __future__ import annotations

@@ -4,14 +4,21 @@ import os
 import sys
 import warnings
 
-from splinecli.cli.signals import DEFERRED, INTERRUPTED, end_on_signals, ignore_signals, report_interruption
+from splinecli.cli.signals import (
+    DEFERRED,
+    INTERRUPTED,
+    end_on_signals,
+    ignore_signals,
+    report_interruption,
+)
 
 
 def run() -> None:
     """Run the command that the arguments specify, and exit. SIGTERM is treated like Ctrl-C."""
     try:
         end_on_signals()
-        # NumPy's products are small here, and on a busy machine several times as fast on one core. It reads this once.
+        # NumPy's products are small here, and on a busy machine several times as fast on one core.
+        # It reads this once.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         if not sys.warnoptions:  # python -W
             warnings.simplefilter("ignore")  # from libraries, such as NumPy
@@ -28,8 +35,9 @@ def run() -> None:
         code = report_interruption()
     ignore_signals()
     if code == INTERRUPTED or "TORCHELASTIC_RUN_ID" in os.environ:
-        # os._exit does not wait for threads. Dask's threads would print tracebacks if they are just starting. PyTorch's
-        # threads sometimes abort a process after its work is done, which torchrun reports as a failure.
+        # os._exit does not wait for threads. Dask's threads would print tracebacks if they are just
+        # starting. PyTorch's threads sometimes abort a process after its work is done, which
+        # torchrun reports as a failure.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -1,4 +1,6 @@
-"""The functions for arrays, for example in a notebook: `splinecli.estimate_normals` and its companions."""
+"""The functions for arrays, for example in a notebook: `splinecli.estimate_normals` and its
+companions.
+"""
 
 from __future__ import annotations
 
@@ -38,53 +40,64 @@ def estimate_normals(
 ) -> NormalEstimate:
     """Estimate surface normals from images of one object under different lights.
 
-    The images are prepared and checked against the lights, and the normals are estimated, exactly as in
-    `splinecli infer`. Warnings that an input is probably wrong, such as light directions in another frame, are also
-    issued with Python's `warnings` module.
+    The images are prepared and checked against the lights, and the normals are estimated, exactly
+    as in `splinecli infer`. Warnings that an input is probably wrong, such as light directions in
+    another frame, are also issued with Python's `warnings` module.
 
-    The first call limits PyTorch's threads to the cores that the process may use. If other processes keep the machine
-    busy, also set the environment variable OMP_WAIT_POLICY to passive before PyTorch is imported.
+    The first call limits PyTorch's threads to the cores that the process may use. If other
+    processes keep the machine busy, also set the environment variable OMP_WAIT_POLICY to passive
+    before PyTorch is imported.
 
     Args:
-        images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
-            uint16 values are scaled by their full range; floating-point values are not scaled.
-        light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
-            None estimates them from the images, as `infer --lights estimate` does. See capture.light_errors_deg.
-        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
-            None uses all pixels.
-        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown; they are then estimated if the images
-            show that they differ.
-        first_light: if light_directions is None, the side of the image from which the first light comes, such as
-            "left" or "upper-left", or its azimuth in degrees, counter-clockwise from the right. It is required if the
-            images show no outline of the object.
-        pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
-            lamps in the same unit, from the middle of the image on the object's mean plane.
-        camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the object's width. The
-            light directions are then in the frame of its axis. None is an orthographic camera.
-        method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See splinecli.estimate.methods.METHODS.
-        as_stored: use the image values unchanged. By default, lens blur is removed, saturated observations are
-            restored and unknown light intensities are estimated.
-        white_level: the value from which an observation is saturated, in the unit of the images. None detects it for
-            integer images; floating-point images then have no white level.
+        images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the
+            top. uint8 and uint16 values are scaled by their full range; floating-point values are
+            not scaled.
+        light_directions: (F, 3), from the object towards the lights, of any length; x right, y up,
+            z to the camera. None estimates them from the images, as `infer --lights estimate` does.
+            See capture.light_errors_deg.
+        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
+            as in a mask file. None uses all pixels.
+        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown; they are then
+            estimated if the images show that they differ.
+        first_light: if light_directions is None, the side of the image from which the first light
+            comes, such as "left" or "upper-left", or its azimuth in degrees, counter-clockwise from
+            the right. It is required if the images show no outline of the object.
+        pixel_size: for near lamps, the width of a pixel on the object. light_directions are then
+            the positions of the lamps in the same unit, from the middle of the image on the
+            object's mean plane.
+        camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the
+            object's width. The light directions are then in the frame of its axis. None is an
+            orthographic camera.
+        method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See
+            splinecli.estimate.methods.METHODS.
+        as_stored: use the image values unchanged. By default, lens blur is removed, saturated
+            observations are restored and unknown light intensities are estimated.
+        white_level: the value from which an observation is saturated, in the unit of the images.
+            None detects it for integer images; floating-point images then have no white level.
         weights: name or file of a network's weights. None is the method's own.
-        rotations: number of rotations of the lights whose normals a network averages. None is the method's own.
-        distil: approximate the method by a small network, trained on a sample of the pixels, for the remaining pixels.
-            False uses the method on every pixel; None distils for 100,000 pixels and more.
+        rotations: number of rotations of the lights whose normals a network averages. None is the
+            method's own.
+        distil: approximate the method by a small network, trained on a sample of the pixels, for
+            the remaining pixels. False uses the method on every pixel; None distils for 100,000
+            pixels and more.
         batch_size: pixels per batch. None is the method's own.
         device: where to compute; "auto" is a CUDA GPU if there is one.
-        precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
-        progress: called with the number of pixels just finished, about every 1,000 pixels for networks.
+        precision: number format of a network; "auto" is bfloat16 where the device computes natively
+            in it.
+        progress: called with the number of pixels just finished, about every 1,000 pixels for
+            networks.
 
     Returns:
-        A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the mask and zero
-        outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None
-        if the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
-        others that have an error head); and capture, with the observations and with warnings that you should read.
+        A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the
+        mask and zero outside; confidence_map, (H, W) float32, the probability that a normal is off
+        by at most 5 degrees, or None if the method does not estimate it (only spline-net and
+        spline-net-pixelwise do, with the shipped weights or others that have an error head); and
+        capture, with the observations and with warnings that you should read.
 
     Raises:
         splinecli.errors.UsageError: a shape, a type or an option does not fit.
-        splinecli.errors.InputError: a value is not finite or negative, the lights cannot give normals (fewer than
-            three, below the horizon, all in one plane), or the mask is empty.
+        splinecli.errors.InputError: a value is not finite or negative, the lights cannot give
+            normals (fewer than three, below the horizon, all in one plane), or the mask is empty.
         splinecli.errors.ModelError: the weights cannot be used.
 
     Examples:
@@ -99,8 +112,8 @@ def estimate_normals(
         [0.36 0.48 0.8 ]
 
     References:
-        Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and normal estimation
-        networks, ICCV 2019.
+        Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and
+        normal estimation networks, ICCV 2019.
     """
     from functools import partial
     from warnings import warn
@@ -116,7 +129,9 @@ def estimate_normals(
     check_method(method)
     find: LightFinder | None = None
     if first_light is not None and light_directions is not None:
-        raise UsageError("first_light is for lights that are found", hint="Leave it or light_directions out")
+        raise UsageError(
+            "first_light is for lights that are found", hint="Leave it or light_directions out"
+        )
     if light_directions is None:
         from splinecli.lights.unknown_lights import find_lights
 
@@ -136,7 +151,9 @@ def estimate_normals(
     estimator = make_estimator(method, options)
     given = None if light_intensities is None else np.asarray(light_intensities, np.float64)
     check = partial(check_arrays, intensities=given)
-    estimate, _ = estimate_capture(capture, lambda: estimator, check, distil=distil, progress=progress)
+    estimate, _ = estimate_capture(
+        capture, lambda: estimator, check, distil=distil, progress=progress
+    )
     for warning in estimate.capture.warnings:
         if warning.is_error:
             warn(str(warning), stacklevel=2)
@@ -144,15 +161,17 @@ def estimate_normals(
 
 
 def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None) -> MaterialMaps:
-    """Estimate base colour, roughness, metalness and specular reflection, as `infer --maps material` does.
+    """Estimate base colour, roughness, metalness and specular reflection, as `infer --maps
+    material` does.
 
     Args:
         estimate: the result of estimate_normals.
-        colours: (F, H, W, 3) linear RGB, the images divided by the light intensities. None, for gray images, gives a
-            gray base colour.
+        colours: (F, H, W, 3) linear RGB, the images divided by the light intensities. None, for
+            gray images, gives a gray base colour.
 
     Returns:
-        A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and roughness, metalness,
+        A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and
+            roughness, metalness,
         specular and confidence (P,). `is_gray` tells whether the base colour is only brightness.
 
     Raises:
@@ -181,7 +200,10 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
         return material_of(estimate)
     stack, expected = np.asarray(colours), (capture.n_lights, *capture.mask.shape, 3)
     if stack.shape != expected or stack.dtype.kind not in "uif":
-        problem = f"found colours of shape {stack.shape} and type {stack.dtype}, expected numbers of shape {expected}"
+        problem = (
+            f"found colours of shape {stack.shape} and type {stack.dtype}, expected numbers of"
+            f" shape {expected}"
+        )
         raise UsageError(problem, hint="Leave colours out for gray images")
     if not np.isfinite(stack[:, capture.mask]).all():
         raise InputError("some colours are not finite", hint="Leave their pixels out of the mask")
@@ -202,21 +224,26 @@ def integrate_normals(
     *,
     discontinuity: float = 2.0,
 ) -> NDArray[np.float64]:
-    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
+    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the
+    mask.
 
-    For an orthographic camera, the result is the height towards the camera in pixels. With a camera matrix, it is the
-    positive depth along the viewing axis, of unknown scale. `splinecli.surface.integration` has further options.
+    For an orthographic camera, the result is the height towards the camera in pixels. With a camera
+    matrix, it is the positive depth along the viewing axis, of unknown scale.
+    `splinecli.surface.integration` has further options.
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
-        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
+        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not
+            zero.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous surface.
+        discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous
+            surface.
 
     Raises:
-        splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
-        splinecli.errors.InputError: the mask is empty, a normal in the mask is not a unit vector, or the camera matrix
-            is not valid.
+        splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is
+        out of range.
+        splinecli.errors.InputError: the mask is empty, a normal in the mask is not a unit vector,
+            or the camera matrix is not valid.
 
     Examples:
         A plane that rises by 0.75 pixels for each column:

@@ -9,16 +9,21 @@ from typing import Any
 def printable(text: object) -> str:
     """Return the text on one line, with escapes such as \\n for all non-printable characters.
 
-    File names may contain any character, including control sequences that move the cursor or forge a line.
+    File names may contain any character, including control sequences that move the cursor or forge
+    a line.
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in str(text))
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in str(text)
+    )
 
 
 class SplinecliError(Exception):
     """A failure that one message explains: "PATH:LINE: PROBLEM. HINT.".
 
     Args:
-        problem: the value found and the value expected, as one sentence without the final full stop.
+        problem: the value found and the value expected, as one sentence without the final full
+            stop.
         path: the file or folder that causes the failure, if any.
         line: the line in that file, counted from 1, if any.
         hint: the remedy, as one sentence without the final full stop.
@@ -36,7 +41,12 @@ class SplinecliError(Exception):
     exit_code = 1
 
     def __init__(
-        self, problem: str, *, path: str | Path | None = None, line: int | None = None, hint: str | None = None
+        self,
+        problem: str,
+        *,
+        path: str | Path | None = None,
+        line: int | None = None,
+        hint: str | None = None,
     ) -> None:
         self.problem = problem
         self.path = None if path is None else Path(path)

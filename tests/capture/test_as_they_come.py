@@ -1,4 +1,5 @@
-"""Captures as people have them: names, formats and folders that are not the usual ones, and what is said of them.
+"""Captures as people have them: names, formats and folders that are not the usual ones, and what is
+said of them.
 
 The oracle is a matte sphere: whatever its files are called, the normals are those of its geometry.
 """
@@ -50,7 +51,8 @@ def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
     assert mask is None or (capture.mask == mask).all()
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     inside = capture.mask & DISC
-    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a degree.
+    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a
+    # degree.
     assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
     return [warning.code for warning in capture.warnings]
 
@@ -60,12 +62,16 @@ def picture(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), image)
 
 
-@pytest.mark.parametrize("name", ["cat_mask.png", "cat.mask.tif", "mask_1.png", "../cat_mask.png", "../cat.mask.bmp"])
+@pytest.mark.parametrize(
+    "name", ["cat_mask.png", "cat.mask.tif", "mask_1.png", "../cat_mask.png", "../cat.mask.bmp"]
+)
 def test_masks_by_name(folder: Path, name: str) -> None:
     picture(folder / name, MASK)
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
-    assert str(source.warnings[0]).startswith(f"{Path(name).name} is used as the mask, by its name.")
+    assert str(source.warnings[0]).startswith(
+        f"{Path(name).name} is used as the mask, by its name."
+    )
     balls = find_ball_files(folder)
     assert len(balls.images) == 12 and balls.mask == source.files.mask
 
@@ -76,14 +82,18 @@ def test_two_masks_are_named_and_none_is_used(folder: Path) -> None:
     picture(folder / "mask_small.png", MASK[::2, ::2])
     source = open_capture(folder)
     assert check(source, np.ones_like(DISC)) == ["mask_choice"]
-    expected = "mask_left.png, mask_right.png: none is used as the mask. Choose one with --mask FILE."
+    expected = (
+        "mask_left.png, mask_right.png: none is used as the mask. Choose one with --mask FILE."
+    )
     assert str(source.warnings[0]) == expected
     assert check(open_capture(folder, mask=folder / "mask_left.png")) == ["images_left_out"]
 
 
 def test_alpha_is_a_mask_if_there_is_no_other(folder: Path) -> None:
     for number, image in enumerate(PICTURES):
-        picture(folder / f"{number:03}.png", np.dstack([image] * 3 + [MASK.astype(np.uint16) * 257]))
+        picture(
+            folder / f"{number:03}.png", np.dstack([image] * 3 + [MASK.astype(np.uint16) * 257])
+        )
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert "The alpha channel of 000.png is used as the mask." in str(source.warnings[0])
@@ -122,12 +132,18 @@ def angles(form: str) -> str:
 
 LINES = "\n".join(" ".join(map(str, row)) for row in rows())
 NAMED = "\n".join(f"{number:03}.png {' '.join(map(str, row))}" for number, row in enumerate(rows()))
-OPENCV = f"%YAML:1.0\nLights: !!opencv-matrix\n   rows: 12\n   cols: 3\n   dt: d\n   data: {LIGHTS.ravel().tolist()}\n"
+OPENCV = (
+    "%YAML:1.0\nLights: !!opencv-matrix\n   rows: 12\n   cols: 3\n   dt: d\n   data:"
+    f" {LIGHTS.ravel().tolist()}\n"
+)
 XYZ = [dict(zip("xyz", row, strict=True)) for row in rows()]
 
 
 def alice(names: list[str], **more: object) -> str:
-    lights = [{"viewId": n, "direction": [x, -y, -z], **more} for n, (x, y, z) in zip(names, rows(), strict=True)]
+    lights = [
+        {"viewId": n, "direction": [x, -y, -z], **more}
+        for n, (x, y, z) in zip(names, rows(), strict=True)
+    ]
     return json.dumps({"lights": lights})
 
 
@@ -135,11 +151,17 @@ NUMBERS = [f"{number:03}" for number in range(12)]
 FOUND = {
     "University of Washington": ("lights.txt", f"12\n{LINES}"),
     "lp": ("dome.lp", f"12\n{NAMED}"),
-    "foreign paths": ("a.LP", "12\n" + re.sub("^", r"C:\\\\RTI\\\\a vase\\\\", NAMED, flags=re.MULTILINE)),
+    "foreign paths": (
+        "a.LP",
+        "12\n" + re.sub("^", r"C:\\\\RTI\\\\a vase\\\\", NAMED, flags=re.MULTILINE),
+    ),
     "by name without suffix": ("a.lp", NAMED.replace(".png", ".JPG")),
     "by order": ("a.lp", "12\n" + re.sub("^", "gone", NAMED, flags=re.MULTILINE)),
     "AliceVision, by name without suffix": ("lights.json", alice(NUMBERS, type="directional")),
-    "AliceVision with intensities, by order": ("lights.json", alice(["47", *NUMBERS[1:]], intensity=[1, 1.0, 1])),
+    "AliceVision with intensities, by order": (
+        "lights.json",
+        alice(["47", *NUMBERS[1:]], intensity=[1, 1.0, 1]),
+    ),
     "csv": ("lights.csv", "x,y,z\n" + LINES.replace(" ", ",")),
     "csv with names": ("lights.csv", "image,x,y,z\n" + NAMED.replace(" ", ",")),
     "list": ("lights.txt", str(rows())),
@@ -151,10 +173,19 @@ FOUND = {
     "OpenCV by object": ("cat_LightMatrix.yml", OPENCV),
     "JSON list": ("lights.json", json.dumps(rows())),
     "JSON with a key": ("light_directions.json", json.dumps({"L": rows()})),
-    "JSON by name": ("lights.json", json.dumps({f"{number:03}.png": row for number, row in enumerate(rows())})),
-    "Relight": ("a.dome", json.dumps({"lightConfiguration": "directional", "directions": XYZ, "positions3d": []})),
-    "Relight with LEDs": ("a.dome", json.dumps({"directions": XYZ, "ledAdjust": [dict.fromkeys("rgb", 1.0)] * 12})),
-}  # fmt: skip
+    "JSON by name": (
+        "lights.json",
+        json.dumps({f"{number:03}.png": row for number, row in enumerate(rows())}),
+    ),
+    "Relight": (
+        "a.dome",
+        json.dumps({"lightConfiguration": "directional", "directions": XYZ, "positions3d": []}),
+    ),
+    "Relight with LEDs": (
+        "a.dome",
+        json.dumps({"directions": XYZ, "ledAdjust": [dict.fromkeys("rgb", 1.0)] * 12}),
+    ),
+}
 
 
 @pytest.mark.parametrize("case", FOUND)
@@ -177,29 +208,54 @@ REFUSED = {
         ("1\n0 0 1", '2: found "0 0 1", expected a file name and x y z'),
         ("1\na.png 0 zero 1", '2: found "zero", expected a number'),
         ("1\na.png 0 0 0", "2: found a zero vector, expected a light direction"),
-        ("2\na.png 0 0 1\nb.png 0 1 -1", "3: found a light below the horizon (z = -1), expected z > 0"),
+        (
+            "2\na.png 0 0 1\nb.png 0 1 -1",
+            "3: found a light below the horizon (z = -1), expected z > 0",
+        ),
         ("2\na.png 0 0 1\nA.PNG 0 1 1", '3: a second light for the image "A.PNG"'),
-        ("2\n000.png 0 0 1\nx.png 0 1 1", '3: found 2 lights but 12 images; the image "x.png" is not among them'),
+        (
+            "2\n000.png 0 0 1\nx.png 0 1 1",
+            '3: found 2 lights but 12 images; the image "x.png" is not among them',
+        ),
     ],
     "lights.json": [
         ("{", "is not JSON (Expecting property name enclosed in double quotes)"),
         ("[]", 'found no list "lights"'),
         ('{"lights": []}', 'found no list "lights"'),
         ('{"lights": [3]}', "light 1: Expected `object`, got `int`"),
-        ('{"lights": [{"type": "point", "direction": [0, 0, -1]}]}', "light 1: Invalid enum value 'point' - at"),
-        ('{"lights": [{"direction": [0, 0]}]}', "light 1: Expected `array` of length 3, got 2 - at `$.direction`"),
-        ('{"lights": [{"direction": [0, 0, NaN]}]}', "cannot be read as JSON (the number NaN is not finite)"),
+        (
+            '{"lights": [{"type": "point", "direction": [0, 0, -1]}]}',
+            "light 1: Invalid enum value 'point' - at",
+        ),
+        (
+            '{"lights": [{"direction": [0, 0]}]}',
+            "light 1: Expected `array` of length 3, got 2 - at `$.direction`",
+        ),
+        (
+            '{"lights": [{"direction": [0, 0, NaN]}]}',
+            "cannot be read as JSON (the number NaN is not finite)",
+        ),
         ('{"lights": [{}]}', "light 1: Object missing required field `direction`"),
-        ('{"lights": [{"direction": [0, 0, 1]}]}', "found a light below the horizon as light 1 (z = -1)"),
-        ('{"lights": [{"direction": [0, 0, -1], "intensity": [1, 0, 1]}]}', "`float` > 0.0 - at `$.intensity[1]`"),
-        ('{"lights": [{"direction": [0, 0, -1], "intensity": [1, 1, 1]}, {"viewId": 2, "direction": [0, 0, -1]}]}',
-         "1 of 2 lights have an intensity, expected all or none"),
+        (
+            '{"lights": [{"direction": [0, 0, 1]}]}',
+            "found a light below the horizon as light 1 (z = -1)",
+        ),
+        (
+            '{"lights": [{"direction": [0, 0, -1], "intensity": [1, 0, 1]}]}',
+            "`float` > 0.0 - at `$.intensity[1]`",
+        ),
+        (
+            '{"lights": [{"direction": [0, 0, -1], "intensity": [1, 1, 1]},'
+            ' {"viewId": 2, "direction": [0, 0, -1]}]}',
+            "1 of 2 lights have an intensity, expected all or none",
+        ),
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "message"), [(name, *case) for name, cases in REFUSED.items() for case in cases]
+    ("name", "text", "message"),
+    [(name, *case) for name, cases in REFUSED.items() for case in cases],
 )
 def test_refused_light_files(folder: Path, name: str, text: str, message: str) -> None:
     (folder / "light_directions.txt").unlink()
@@ -214,7 +270,10 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(folder: Path, tmp_
     (folder / "lights.json").write_text(alice(NUMBERS, intensity=[2.0, 1.0, 0.5]))
     assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 12
     (tmp_path / "intensities.txt").write_text("3\n" * 12)
-    assert open_capture(folder, intensities=tmp_path / "intensities.txt").light_intensities.tolist() == [[3.0] * 3] * 12
+    assert (
+        open_capture(folder, intensities=tmp_path / "intensities.txt").light_intensities.tolist()
+        == [[3.0] * 3] * 12
+    )
 
 
 def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -> None:
@@ -224,7 +283,9 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -
     lines = re.sub("^", "schräg ", NAMED, flags=re.MULTILINE).splitlines()[:4]
     (folder / "capture.lp").write_bytes("\n".join(["4", *lines]).encode("latin-1"))
     source = open_capture(folder)
-    assert [path.name for path in source.files.images] == [f"schräg {number}.png" for number in NUMBERS[:4]]
+    assert [path.name for path in source.files.images] == [
+        f"schräg {number}.png" for number in NUMBERS[:4]
+    ]
     assert [warning.code for warning in source.warnings] == ["images_left_out"]
     assert "names 4 of the 12 images; the others were left out" in str(source.warnings[0])
 
@@ -234,7 +295,11 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -
     [
         ("../lights.txt", LINES, r"Add --lights .*lights\.txt\."),
         ("dirs.txt", LINES, r"Add --lights .*cat/dirs\.txt\."),
-        ("TiltSlant.txt", "tilt slant\n" + angles("slant-tilt"), r"Add .*Slant\.txt --light-format slant-tilt"),
+        (
+            "TiltSlant.txt",
+            "tilt slant\n" + angles("slant-tilt"),
+            r"Add .*Slant\.txt --light-format slant-tilt",
+        ),
         ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --light-format azel"),
     ],
 )
@@ -252,7 +317,12 @@ def test_light_files_that_are_named(folder: Path, name: str, text: str, hint: st
 def test_a_dome_has_positions(folder: Path) -> None:
     lamps = LIGHTS * 300 + (0, 0, 20)
     positions = [dict(zip("xyz", row, strict=True)) for row in rows(lamps)]
-    dome = {"lightConfiguration": "spherical", "directions": XYZ, "positionsSphere": positions, "positions3d": XYZ}
+    dome = {
+        "lightConfiguration": "spherical",
+        "directions": XYZ,
+        "positionsSphere": positions,
+        "positions3d": XYZ,
+    }
     (folder / "a.dome").write_text(json.dumps(dome))
     np.testing.assert_allclose(read_light_positions(folder / "a.dome", 12), lamps, rtol=1e-12)
     (folder / "a.dome").write_text(json.dumps({"directions": XYZ}))
@@ -281,7 +351,9 @@ def test_copies_are_one_photograph(folder: Path) -> None:
         picture(folder / f"{number:03}.jpg", (image >> 8).astype(np.uint8))
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
-    assert str(source.warnings[0]).startswith("12 files (.jpg) have the names of other images (.png)")
+    assert str(source.warnings[0]).startswith(
+        "12 files (.jpg) have the names of other images (.png)"
+    )
 
 
 def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) -> None:
@@ -289,11 +361,15 @@ def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) 
         picture(folder / name, PICTURES[0])
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
-    assert "no light for them, and the other images have another form of name" in str(source.warnings[0])
+    assert "no light for them, and the other images have another form of name" in str(
+        source.warnings[0]
+    )
     assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
     for number in (12, 13):
         picture(folder / f"{number:03}.png", PICTURES[0])
-    with pytest.raises(InputError, match=r"found 12 light directions, expected 17.* it has none for 012\.png"):
+    with pytest.raises(
+        InputError, match=r"found 12 light directions, expected 17.* it has none for 012\.png"
+    ):
         open_capture(folder)
 
 
@@ -308,12 +384,19 @@ def write_stack(folder: Path) -> None:
 
 
 WRITERS = {
-    "16-bit PGM": lambda folder: [write_pnm(folder / f"{n}", PICTURES[n], 65535) for n in range(12)],
-    "12-bit PGM": lambda folder: [write_pnm(folder / f"{n}", PICTURES[n] >> 4, 4095) for n in range(12)],
-    "PPM": lambda folder: [picture(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)],
+    "16-bit PGM": lambda folder: [
+        write_pnm(folder / f"{n}", PICTURES[n], 65535) for n in range(12)
+    ],
+    "12-bit PGM": lambda folder: [
+        write_pnm(folder / f"{n}", PICTURES[n] >> 4, 4095) for n in range(12)
+    ],
+    "PPM": lambda folder: [
+        picture(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)
+    ],
     "stack": write_stack,
-    "LZW stack": lambda folder: cv2.imwritemulti(str(folder / "stack.tif"), list(PICTURES)),  # OpenCV's TIFF is LZW
-}  # fmt: skip
+    # OpenCV's TIFF is LZW
+    "LZW stack": lambda folder: cv2.imwritemulti(str(folder / "stack.tif"), list(PICTURES)),
+}
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -329,7 +412,12 @@ def test_images_of_other_formats(folder: Path, form: str) -> None:
         assert source.facts[0].white_level == 4095
     if form in ("stack", "LZW stack"):
         assert source.files.images[3].name == "stack.tif[3]"
-        assert check_sample(CaptureSample.of_source(source, summarise_capture(source).samples, range(12)))[1] == []
+        assert (
+            check_sample(
+                CaptureSample.of_source(source, summarise_capture(source).samples, range(12))
+            )[1]
+            == []
+        )
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".avif", ".heic"])
@@ -349,7 +437,9 @@ def test_display_encoded_formats(folder: Path, suffix: str) -> None:
     assert angle_between_deg(normals[DISC], NORMALS[DISC]).mean() < 0.5
 
 
-def test_formats_that_need_an_extra_or_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_formats_that_need_an_extra_or_are_not_read(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for path in folder.glob("*.png"):
         path.rename(path.with_suffix(".heic"))
         path.with_suffix(".heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0" + bytes(64))

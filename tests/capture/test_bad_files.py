@@ -41,7 +41,9 @@ def test_a_truncated_tiff(folder: Path) -> None:
     data = (folder / "2.tif").read_bytes()
     for size in (0, 8, 9, 60, 100, 200, 1000, -10):
         (folder / "2.tif").write_bytes(data[:size])
-        with pytest.raises(InputError, match=r"2\.tif: (the TIFF is (truncated|damaged)|the file is empty)"):
+        with pytest.raises(
+            InputError, match=r"2\.tif: (the TIFF is (truncated|damaged)|the file is empty)"
+        ):
             read_capture(folder)
 
 
@@ -60,9 +62,12 @@ def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: b
 
 
 @pytest.mark.parametrize(
-    "name", ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"]
+    "name",
+    ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"],
 )
-def test_a_file_that_may_not_be_read(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_file_that_may_not_be_read(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     """Even root may not."""
     cv2.imwrite(str(folder / "mask.png"), np.full((20, 25), 255, np.uint8))
     cv2.imwrite(str(folder / "ambient.png"), np.full((20, 25), 255, np.uint8))

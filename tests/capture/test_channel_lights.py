@@ -25,8 +25,12 @@ LIGHTS = np.concatenate((ring_lights(3, 35), ring_lights(3, 50, 0.8)))
 CROSSTALK = np.array([[1.0, 0.2, 0.05], [0.15, 1.3, 0.2], [0.02, 0.25, 0.7]])
 
 
-def photograph(lights: Floats, crosstalk: Floats = CROSSTALK, paint: Floats | float = 1.0) -> NDArray[np.uint16]:
-    """Return colour images (N, H, W, 3) of a sphere under three lights (3 N, 3) each; `paint` has its colours."""
+def photograph(
+    lights: Floats, crosstalk: Floats = CROSSTALK, paint: Floats | float = 1.0
+) -> NDArray[np.uint16]:
+    """Return colour images (N, H, W, 3) of a sphere under three lights (3 N, 3) each; `paint` has
+    its colours.
+    """
     shading = shade(NORMALS, lights).reshape(*MASK.shape, -1, 3) * MASK[..., None, None]
     images = np.moveaxis(shading, 2, 0) @ crosstalk.T * paint
     return np.rint(images * 30_000).astype(np.uint16)
@@ -34,7 +38,13 @@ def photograph(lights: Floats, crosstalk: Floats = CROSSTALK, paint: Floats | fl
 
 def write(folder: Path, count: int, paint: Floats | float = 1.0) -> Path:
     lights = LIGHTS[: 3 * count]
-    write_capture(folder, photograph(lights, paint=paint), lights, mask=MASK, normals=NORMALS.astype(np.float32))
+    write_capture(
+        folder,
+        photograph(lights, paint=paint),
+        lights,
+        mask=MASK,
+        normals=NORMALS.astype(np.float32),
+    )
     np.savetxt(folder / "crosstalk.txt", CROSSTALK)
     return folder
 
@@ -56,7 +66,9 @@ def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path:
     folder = write(tmp_path / "gray", count)
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
     report = json.loads((tmp_path / "out/gray/report.json").read_text())
-    assert report["n_lights"] == 3 * count and "lights_in_channels" in [each["code"] for each in report["warnings"]]
+    assert report["n_lights"] == 3 * count and "lights_in_channels" in [
+        each["code"] for each in report["warnings"]
+    ]
 
 
 def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
@@ -68,7 +80,9 @@ def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
     source = reading.open(folder)
     assert source.image_names((0, 2)) == ["000.png (R)", "000.png (B)"]
     np.savetxt(folder / "light_directions.txt", LIGHTS[:1])
-    with pytest.raises(InputError, match=r"found 1 light direction, expected 3, three for each image.* R, G, B"):
+    with pytest.raises(
+        InputError, match=r"found 1 light direction, expected 3, three for each image.* R, G, B"
+    ):
         reading.open(folder)
 
 

@@ -1,4 +1,6 @@
-"""The layout of CyclesPS, on trees written here as they are published: what goes in comes out, value for value."""
+"""The layout of CyclesPS, on trees written here as they are published: what goes in comes out,
+value for value.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +14,15 @@ from splinecli.capture import capture_name, find_captures, open_capture, read_ca
 from splinecli.errors import InputError
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
-LIGHTS = np.array([(0.1, 0.2, 0.9), (-0.7, 0.1, 0.5), (0.3, -0.6, 0.4), (0.0, 0.5, 0.6), (0.5, 0.5, 0.3)])
+LIGHTS = np.array(
+    [(0.1, 0.2, 0.9), (-0.7, 0.1, 0.5), (0.3, -0.6, 0.4), (0.0, 0.5, 0.6), (0.5, 0.5, 0.3)]
+)
 
 
 def normals() -> np.ndarray:
-    """Unit normals (HEIGHT, WIDTH, 3) that no mirror image or exchange of axes maps onto each other."""
+    """Unit normals (HEIGHT, WIDTH, 3) that no mirror image or exchange of axes maps onto each
+    other.
+    """
     y, x = np.mgrid[0.5:-0.4:7j, -0.6:0.7:11j]
     return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
 
@@ -31,7 +37,9 @@ def boundaries() -> tuple[np.ndarray, np.ndarray]:
     return inner, rim
 
 
-def write_object(folder: Path, *kinds: str, seed: int = 0, n_lights: int = 5) -> dict[str, np.ndarray]:
+def write_object(
+    folder: Path, *kinds: str, seed: int = 0, n_lights: int = 5
+) -> dict[str, np.ndarray]:
     """An object as published; returns the images (F, H, W, 3) of each kind."""
     folder.mkdir(parents=True)
     np.savetxt(folder / "light.txt", LIGHTS[:n_lights], fmt="%.6f")
@@ -83,9 +91,14 @@ def test_every_value_is_what_was_written(tmp_path: Path) -> None:
     assert not capture.ground_truth[~mask].any()
 
 
-def test_an_object_with_one_kind_is_that_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_object_with_one_kind_is_that_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_object(tmp_path / "Bunny", "diffuse")
-    by_object, by_folder = read_capture(tmp_path / "Bunny"), read_capture(tmp_path / "Bunny/images_diffuse")
+    by_object, by_folder = (
+        read_capture(tmp_path / "Bunny"),
+        read_capture(tmp_path / "Bunny/images_diffuse"),
+    )
     assert by_object.name == by_folder.name == "Bunny_diffuse"
     np.testing.assert_array_equal(by_object.observations, by_folder.observations)
     monkeypatch.chdir(tmp_path / "Bunny/images_diffuse")
@@ -97,14 +110,23 @@ def test_find_captures(tree: Path) -> None:
     objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
     of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
     of_diffuse = [tree / f"PRPS_Diffuse/{name}/images_diffuse" for name in ("Bunny9", "Bunny10")]
-    assert find_captures(tree / "PRPS/Bunny9/images_specular") == [tree / "PRPS/Bunny9/images_specular"]
+    assert find_captures(tree / "PRPS/Bunny9/images_specular") == [
+        tree / "PRPS/Bunny9/images_specular"
+    ]
     assert find_captures(tree / "PRPS/Bunny9") == of_prps[:2]
     assert find_captures(tree / "PRPS") == of_prps
     assert find_captures(tree / "PRPS_Diffuse") == of_diffuse
     assert find_captures(tree) == of_prps + of_diffuse
-    assert f"There are captures in {tree}: give that folder." in message(lambda: find_captures(tree.parent))
+    assert f"There are captures in {tree}: give that folder." in message(
+        lambda: find_captures(tree.parent)
+    )
     names = [capture_name(folder) for folder in find_captures(tree)]
-    assert names[1:5] == ["Bunny9_specular", "Bunny10_metallic", "Bunny10_specular", "Bunny9_diffuse"]
+    assert names[1:5] == [
+        "Bunny9_specular",
+        "Bunny10_metallic",
+        "Bunny10_specular",
+        "Bunny9_diffuse",
+    ]
 
 
 def test_missing_files_of_the_object(tmp_path: Path) -> None:
@@ -114,15 +136,21 @@ def test_missing_files_of_the_object(tmp_path: Path) -> None:
     assert read_capture(folder).ground_truth is None
     lights = (folder / "light.txt").rename(tmp_path / "l.txt")
     found = message(lambda: open_capture(folder / "images_specular"))
-    assert found.startswith(f"{folder}: found no light.txt, expected the light directions of images_specular. Pass --l")
+    assert found.startswith(
+        f"{folder}: found no light.txt, expected the light directions of images_specular. Pass --l"
+    )
     assert read_capture(folder, lights=lights).n_lights == 5
     lights.rename(folder / "light.txt")
     (folder / "onboundary.png").unlink()
     found = message(lambda: open_capture(folder))
-    assert found.startswith(f"{folder}: found no onboundary.png, expected the masks") and "Pass --mask FILE" in found
+    assert (
+        found.startswith(f"{folder}: found no onboundary.png, expected the masks")
+        and "Pass --mask FILE" in found
+    )
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), boundaries()[1])
-    assert read_capture(folder, mask=mask).n_pixels == 7  # above half of the largest, as in other layouts
+    # above half of the largest, as in other layouts
+    assert read_capture(folder, mask=mask).n_pixels == 7
 
 
 def test_masks_that_do_not_fit(tmp_path: Path) -> None:
@@ -132,7 +160,12 @@ def test_masks_that_do_not_fit(tmp_path: Path) -> None:
     assert read_capture(folder).n_pixels == 21
     cv2.imwrite(str(folder / "inboundary.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
     found = message(lambda: read_capture(folder))
-    assert found == f"{folder}: the mask is empty: every pixel of inboundary.png and onboundary.png is zero."
+    assert (
+        found
+        == f"{folder}: the mask is empty: every pixel of inboundary.png and onboundary.png is zero."
+    )
     cv2.imwrite(str(folder / "onboundary.png"), np.ones((WIDTH, HEIGHT), np.uint8))
     found = message(lambda: read_capture(folder))
-    assert found.endswith("onboundary.png: found a mask of 7 x 11 pixels, expected 11 x 7 as in 00000.tif.")
+    assert found.endswith(
+        "onboundary.png: found a mask of 7 x 11 pixels, expected 11 x 7 as in 00000.tif."
+    )

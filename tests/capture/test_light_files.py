@@ -1,4 +1,6 @@
-"""Light files: every accepted way of writing one, as people have them, and the message for every wrong one."""
+"""Light files: every accepted way of writing one, as people have them, and the message for every
+wrong one.
+"""
 
 import json
 import tempfile
@@ -63,14 +65,20 @@ def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> 
 
 @settings(deadline=None)
 @given(
-    vectors=st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)), min_size=4, max_size=12),
+    vectors=st.lists(
+        st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)),
+        min_size=4,
+        max_size=12,
+    ),
     separator=st.sampled_from([" ", "\t", ",", ";", " ,\t", " ; "]),
     counted=st.booleans(),
     transposed=st.booleans(),
 )
 def test_directions_round_trip(vectors, separator, counted, transposed):
     values = np.array(vectors)
-    rows = [separator.join(repr(float(v)) for v in row) for row in (values.T if transposed else values)]
+    rows = [
+        separator.join(repr(float(v)) for v in row) for row in (values.T if transposed else values)
+    ]
     with tempfile.TemporaryDirectory() as folder:
         path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
         directions = read_light_directions(path, len(values))
@@ -87,12 +95,24 @@ COMMA = "A comma separates columns; write decimals with a point."
         ("0 0 1\n\n0 1\n0 1 1", 3, "found 2 columns, expected 3 as in the other lines"),
         ("0 0 1 1\n" * 5, 1, "found 4 columns, expected 3 (x y z)"),
         ("0,1,0,2,0,9\n" * 5, 1, f"found 6 columns, expected 3 (x y z). {COMMA}"),
-        ("0.1 0.2 1\n0,1 0,2 1\n0.1 0.2 1", 2, f"found 5 columns, expected 3 as in the other lines. {COMMA}"),
-        ("0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1", 2, "found 4 columns, expected 3 as in the other lines"),
+        (
+            "0.1 0.2 1\n0,1 0,2 1\n0.1 0.2 1",
+            2,
+            f"found 5 columns, expected 3 as in the other lines. {COMMA}",
+        ),
+        (
+            "0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1",
+            2,
+            "found 4 columns, expected 3 as in the other lines",
+        ),
         ("# lights\n0 0 1\n0 one 1", 3, 'found "one", expected a number'),
         ("0 0 1\n0 1_0 1", 2, 'found "1_0", expected a number'),
         ("0 0 1\n0 1e999 1", 2, 'found "1e999", expected a finite number'),
-        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, "found a light below the horizon in column 4 (z = 0), expected z > 0"),
+        (
+            "0 0 0 1\n0 1 0 0\n1 1 1 0",
+            3,
+            "found a light below the horizon in column 4 (z = 0), expected z > 0",
+        ),
         ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line says 5, but 4 rows follow"),
         ("0.5\n0 0 1\n0 1 1", 1, "found 1 column, expected 3 columns or a count"),
         ("0 0 1\n0 1 1\n1 0 1", None, "found 3 light directions, expected 5, one for each image"),
@@ -103,7 +123,9 @@ def test_wrong_directions(tmp_path: Path, text: str, line: int | None, message: 
     path = write(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_light_directions(path, 5 if line is None else None)
-    assert str(caught.value).startswith(f"{path}: {message}" if line is None else f"{path}:{line}: {message}")
+    assert str(caught.value).startswith(
+        f"{path}: {message}" if line is None else f"{path}:{line}: {message}"
+    )
     assert (caught.value.path, caught.value.line) == (path, line)
 
 
@@ -118,18 +140,28 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             read_light_directions(tmp_path / name)
-    with pytest.raises(InputError, match=r"expected a text file with a line r g b for each image\."):
+    with pytest.raises(
+        InputError, match=r"expected a text file with a line r g b for each image\."
+    ):
         read_light_intensities(tmp_path / "mask.png", 3)
 
 
-COLOURED = ("1 2 4\n2 2 2\n1 1 1\n3 3 3", "4\n1,2,4\n2,2,2\n1,1,1\n3,3,3", "1 2 1 3\n2 2 1 3\n4 2 1 3")
+COLOURED = (
+    "1 2 4\n2 2 2\n1 1 1\n3 3 3",
+    "4\n1,2,4\n2,2,2\n1,1,1\n3,3,3",
+    "1 2 1 3\n2 2 1 3\n4 2 1 3",
+)
 GRAY = ("3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5")
 
 
 @pytest.mark.parametrize("text", COLOURED + GRAY)
 def test_intensities(tmp_path: Path, text: str) -> None:
     """In rows, after a count, or in columns; gray ones count for every channel."""
-    expected = [[3] * 3, [1] * 3, [2] * 3, [5] * 3] if text in GRAY else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
+    expected = (
+        [[3] * 3, [1] * 3, [2] * 3, [5] * 3]
+        if text in GRAY
+        else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
+    )
     np.testing.assert_array_equal(read_light_intensities(write(tmp_path, text), 4), expected)
 
 
@@ -137,11 +169,17 @@ def test_intensities(tmp_path: Path, text: str) -> None:
     ("text", "message"),
     [
         ("1 1 1\n1 0 1\n1 1 1\n1 1 1", ":2: found the intensity 0, expected a number above 0."),
-        ("1 1 1 1\n1 1 -2 1\n1 1 1 1", ":2: found the intensity -2 in column 3, expected a number above 0."),
+        (
+            "1 1 1 1\n1 1 -2 1\n1 1 1 1",
+            ":2: found the intensity -2 in column 3, expected a number above 0.",
+        ),
         ("1 1\n1 1\n1 1\n1 1", ":1: found 2 columns, expected 3 (R G B) or 1 (gray)."),
         ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", ':2: found "inf", expected a finite number.'),
         ("1 1 1\n1 1 1", ": found 2 light intensities, expected 4, one for each image."),
-        ("1 1 1\n1 1e308 1\n1 1 1\n1 1 1", ":2: found the intensity 1e+308, expected a number from 1e-12 to"),
+        (
+            "1 1 1\n1 1e308 1\n1 1 1\n1 1 1",
+            ":2: found the intensity 1e+308, expected a number from 1e-12 to",
+        ),
     ],
 )
 def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
@@ -163,8 +201,10 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
 @pytest.mark.parametrize(
     "text",
     [
-        "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0.8",
-        'C:\\shoot\\img3.PNG 0 -0,6 0,8\n"img2.png" 0,6 0 0,8\nimg1.png 0 0 1\nimg10.png -0,48 0,36 0,8',
+        "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0."
+        "8",
+        'C:\\shoot\\img3.PNG 0 -0,6 0,8\n"img2.png" 0,6 0 0,8\nimg1.png 0 0'
+        " 1\nimg10.png -0,48 0,36 0,8",
         "name z y x\nimg1 1 0 0\nimg2 0.8 0 0.6\nimg3 0.8 -0.6 0\nimg10 0.8 0.36 -0.48",
         "4\nimg1 0 0 1\nimg2 0.6 0 0.8\nimg3 0 -0.6 0.8\nimg10 -0.48 0.36 0.8",
     ],
@@ -183,16 +223,29 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
 
 @pytest.mark.parametrize(
     ("factors", "message"),
-    [([1, 2, 4, 8], None), ([1, 2, 4], "3 factors for 4 lights"), ([1, 2, 4, 1e-320], "not from 1e-12 to 1e")],
+    [
+        ([1, 2, 4, 8], None),
+        ([1, 2, 4], "3 factors for 4 lights"),
+        ([1, 2, 4, 1e-320], "not from 1e-12 to 1e"),
+    ],
 )
-def test_factors_of_a_dome_are_inverse_intensities(tmp_path: Path, factors: list[float], message: str | None) -> None:
+def test_factors_of_a_dome_are_inverse_intensities(
+    tmp_path: Path, factors: list[float], message: str | None
+) -> None:
     path = tmp_path / "a.dome"
     lights = [dict(zip("xyz", row, strict=True)) for row in DIRECTIONS.tolist()]
     path.write_text(
-        json.dumps({"directions": lights, "ledAdjust": [dict.fromkeys("rgb", factor) for factor in factors]})
+        json.dumps(
+            {
+                "directions": lights,
+                "ledAdjust": [dict.fromkeys("rgb", factor) for factor in factors],
+            }
+        )
     )
     if message is None:
-        np.testing.assert_allclose(read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T)
+        np.testing.assert_allclose(
+            read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T
+        )
     else:
         with pytest.raises(InputError, match=message):
             read_lights(path, 4)
@@ -201,7 +254,9 @@ def test_factors_of_a_dome_are_inverse_intensities(tmp_path: Path, factors: list
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".lp", ".csv"])
 def test_written_lights_are_read_again(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"lights{suffix}"
-    path.write_bytes(check_writable(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)]))
+    path.write_bytes(
+        check_writable(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)])
+    )
     np.testing.assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
     if suffix == ".csv":
         assert path.read_text().splitlines()[0] == "x,y,z"
@@ -221,15 +276,43 @@ ADD_AZEL = ".*add --light-format azel"
 @pytest.mark.parametrize(
     ("form", "text", "message"),
     [
-        ("xyz", "0 90\n30 45\n120 45\n240 45", f"2 columns of angles, expected 3 columns{ADD_AZEL}"),
-        ("xyz", "1 0 90\n2 30 45\n3 120 45\n4 240 45", f"a number and two angles, expected 3 columns{ADD_AZEL}"),
-        ("xyz", "0 30 1\n90 40 1\n180 45 1\n270 30 1", f"and 1, expected x y z.*Leave the third{ADD_AZEL}"),
+        (
+            "xyz",
+            "0 90\n30 45\n120 45\n240 45",
+            f"2 columns of angles, expected 3 columns{ADD_AZEL}",
+        ),
+        (
+            "xyz",
+            "1 0 90\n2 30 45\n3 120 45\n4 240 45",
+            f"a number and two angles, expected 3 columns{ADD_AZEL}",
+        ),
+        (
+            "xyz",
+            "0 30 1\n90 40 1\n180 45 1\n270 30 1",
+            f"and 1, expected x y z.*Leave the third{ADD_AZEL}",
+        ),
         ("xyz", "a.png 0 30\nb.png 90 40\nc.png 180 45", f"a name and 2 numbers{ADD_AZEL}"),
-        ("azel", "30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
+        (
+            "azel",
+            "30 45\n120 100\n240 45",
+            r":2: found azimuth 120 and elevation 100, expected -360 to 360",
+        ),
         ("azel", "30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
-        ("azel", "0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians.*57.2958"),
-        ("azel", "azimuth zenith\n30 45\n120 40\n240 45", r':1: found the column "zenith".*90 minus the angle'),
-        ("azel", "0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
+        (
+            "azel",
+            "0.5 0.7\n2.1 0.8\n4.2 0.9",
+            "no angle is above 2 pi, so they look like radians.*57.2958",
+        ),
+        (
+            "azel",
+            "azimuth zenith\n30 45\n120 40\n240 45",
+            r':1: found the column "zenith".*90 minus the angle',
+        ),
+        (
+            "azel",
+            "0 0 1\n1 0 1\n0 1 1\n1 1 1",
+            r"found 3 columns, expected 2 \(azimuth elevation\)",
+        ),
         ("slant-tilt", "30 45\n100 100", ":2: found slant 100 and tilt 100, expected"),
     ],
 )
@@ -250,7 +333,10 @@ def write_opencv(path: Path, **matrices: np.ndarray) -> Path:
 @pytest.mark.parametrize("transposed", [False, True])
 def test_arrays(tmp_path: Path, suffix: str, transposed: bool) -> None:
     """Written by NumPy, OpenCV and SciPy themselves."""
-    stored, path = 5 * (DIRECTIONS.T if transposed else DIRECTIONS).astype(np.float32), tmp_path / f"lights{suffix}"
+    stored, path = (
+        5 * (DIRECTIONS.T if transposed else DIRECTIONS).astype(np.float32),
+        tmp_path / f"lights{suffix}",
+    )
     if suffix == ".npy":
         np.save(path, stored)
     elif "mat" in suffix:
@@ -272,7 +358,9 @@ def test_refused_arrays(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             read_light_directions(tmp_path / "lights.npy", 4)
     savemat(tmp_path / "leds.mat", {"Dir": DIRECTIONS.T, "S": DIRECTIONS})
-    with pytest.raises(InputError, match=r"several matrices N x 3 or 3 x N: Dir \(3 x 4\), S \(4 x 3\)"):
+    with pytest.raises(
+        InputError, match=r"several matrices N x 3 or 3 x N: Dir \(3 x 4\), S \(4 x 3\)"
+    ):
         read_light_directions(tmp_path / "leds.mat", 4)
     with pytest.raises(InputError, match=r"no matrix N x 3 or 3 x N: K \(2 x 2\)"):
         read_light_directions(write_opencv(tmp_path / "k.yml", K=np.eye(2)), 4)
@@ -282,9 +370,21 @@ def test_refused_arrays(tmp_path: Path) -> None:
     ("name", "content", "problem"),
     [
         ("a.yml", b"", "no matrix"),
-        ("a.yml", b"lights: !!opencv-matrix\n rows: 2\n cols: 3\n dt: d\n data: [ 1, 2 ]\n", "is damaged"),
-        ("a.yml", b"lights: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, x, 2 ]\n", "is damaged"),
-        ("a.yml", b"l: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, .Nan, 2 ]\n", "damaged"),
+        (
+            "a.yml",
+            b"lights: !!opencv-matrix\n rows: 2\n cols: 3\n dt: d\n data: [ 1, 2 ]\n",
+            "is damaged",
+        ),
+        (
+            "a.yml",
+            b"lights: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, x, 2 ]\n",
+            "is damaged",
+        ),
+        (
+            "a.yml",
+            b"l: !!opencv-matrix\n rows: 1\n cols: 3\n dt: d\n data: [ 1, .Nan, 2 ]\n",
+            "damaged",
+        ),
         ("a.xml", b"<?xml version='1.0'?><opencv_storage></opencv_storage>", "no matrix"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(300), "is damaged|no matrix"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(300), "7.3 file, which is not supported"),
@@ -306,7 +406,9 @@ def test_damaged_matrices(tmp_path: Path, name: str, content: bytes, problem: st
         ("a.xml", "", '<l type_id="opencv-matrix"><rows>1</rows><cols>3</cols><dt>d</dt><data>1'),
     ],
 )
-def test_the_time_of_a_file_does_not_grow_with_the_square_of_its_length(tmp_path, name, start, unit):
+def test_the_time_of_a_file_does_not_grow_with_the_square_of_its_length(
+    tmp_path, name, start, unit
+):
     (tmp_path / name).write_text(start + unit * (900_000 // len(unit)))
     started = time.process_time()
     with pytest.raises(InputError, match="no matrix"):

@@ -80,9 +80,13 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
     falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
     falloff = np.broadcast_to(falloff[:1], light.shape) if one else falloff
     folder = store(tmp_path / "capture", light * falloff)
-    flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(1 if one else 4))
+    flats = tuple(
+        write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(1 if one else 4)
+    )
     mean = falloff.mean(axis=(1, 2, 3), keepdims=True)
-    np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
+    np.testing.assert_allclose(
+        observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4
+    )
 
 
 def test_some_pixels_are_as_among_all(tmp_path: Path, light: NDArray[np.float64]) -> None:
@@ -90,11 +94,19 @@ def test_some_pixels_are_as_among_all(tmp_path: Path, light: NDArray[np.float64]
     rng = np.random.default_rng(3)
     folder, wanted = store(tmp_path / "capture", light), np.array([3, 40, 41, 98])
     ambient = write(tmp_path / "ambient.png", rng.uniform(0, 0.05, light.shape[1:]))
-    flats = tuple(write(tmp_path / f"flat/{n}.png", rng.uniform(0.3, 0.6, light.shape[1:])) for n in range(4))
+    flats = tuple(
+        write(tmp_path / f"flat/{n}.png", rng.uniform(0.3, 0.6, light.shape[1:])) for n in range(4)
+    )
     for flat_field in (flats, flats[:1]):
-        source = open_capture(folder, radiometry=RadiometricCalibration(ambient=ambient, flat_field=flat_field))
-        every = list(source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels))
-        some = source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels, wanted=wanted)
+        source = open_capture(
+            folder, radiometry=RadiometricCalibration(ambient=ambient, flat_field=flat_field)
+        )
+        every = list(
+            source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels)
+        )
+        some = source.read_pixels(
+            np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels, wanted=wanted
+        )
         for whole, part in zip(every, some, strict=True):
             np.testing.assert_array_equal(part.linear, whole.linear[wanted])
             np.testing.assert_array_equal(part.values, whole.values)
@@ -102,7 +114,10 @@ def test_some_pixels_are_as_among_all(tmp_path: Path, light: NDArray[np.float64]
 
 def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> None:
     folder = store(tmp_path / "capture", light)
-    small, black = write(tmp_path / "small.png", light[0, :5]), write(tmp_path / "black.png", 0 * light[0])
+    small, black = (
+        write(tmp_path / "small.png", light[0, :5]),
+        write(tmp_path / "black.png", 0 * light[0]),
+    )
     for settings, message in (
         ({"ambient": small}, r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"),
         ({"flat_field": (small,)}, r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"),
@@ -138,19 +153,32 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
         image.write_bytes(with_chunk(image.read_bytes(), b"sRGB", b"\0"))
     np.testing.assert_array_equal(observed(folder), mixed)  # it is asked to be linear
     capture = read_capture(folder)
-    assert "display_decoded" in codes(capture.warnings) and "display_encoded" not in codes(capture.warnings)
+    assert "display_decoded" in codes(capture.warnings) and "display_encoded" not in codes(
+        capture.warnings
+    )
     np.testing.assert_array_equal(capture.observations, observed(folder, curve=None))
     assert (capture.observations < mixed).all()
     assert open_capture(folder).stamp != srgb_source.stamp
 
 
 def test_linear_8_bit_values_lie_between_rounded_and_cut_ones() -> None:
-    """The mean mistake is a quarter of a step in both cases. Black stays black; 16 bits and encoded values stay."""
+    """The mean mistake is a quarter of a step in both cases. Black stays black; 16 bits and encoded
+    values stay.
+    """
     light = np.linspace(1, 254, 100_001) / 255
-    rounded, cut = (linear_light(steps(255 * light).astype(np.uint8), Path("a.png")) for steps in (np.rint, np.floor))
+    rounded, cut = (
+        linear_light(steps(255 * light).astype(np.uint8), Path("a.png"))
+        for steps in (np.rint, np.floor)
+    )
     assert (rounded - light).mean() * 255 == pytest.approx(0.25, abs=0.01)
     assert (cut - light).mean() * 255 == pytest.approx(-0.25, abs=0.01)
     zero_and_one = np.arange(2, dtype=np.uint8)
-    np.testing.assert_allclose(linear_light(zero_and_one, Path("a.png")) * 255, (0, 1.25), rtol=1e-6)
-    np.testing.assert_allclose(linear_light(zero_and_one, Path("a.jpg"), 2.2) * 255**2.2, (0, 1), rtol=1e-5)
-    np.testing.assert_allclose(linear_light(zero_and_one.astype(np.uint16), Path("a.png")) * 65_535, (0, 1), rtol=1e-6)
+    np.testing.assert_allclose(
+        linear_light(zero_and_one, Path("a.png")) * 255, (0, 1.25), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        linear_light(zero_and_one, Path("a.jpg"), 2.2) * 255**2.2, (0, 1), rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        linear_light(zero_and_one.astype(np.uint16), Path("a.png")) * 65_535, (0, 1), rtol=1e-6
+    )

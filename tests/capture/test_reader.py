@@ -1,5 +1,5 @@
-"""Whole captures: observations against the photographs written, and real ones against known errors; what the record
-refuses; reading ahead.
+"""Whole captures: observations against the photographs written, and real ones against known errors;
+what the record refuses; reading ahead.
 """
 
 import subprocess
@@ -43,16 +43,29 @@ def texts(warnings: Iterable[CaptureWarning]) -> tuple[str, ...]:
     return tuple(str(warning) for warning in warnings)
 
 
-def expected(photographs: NDArray[np.uint16], intensities: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected(
+    photographs: NDArray[np.uint16], intensities: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(P, F) for the whole image, in float64."""
-    return np.asarray((photographs / 65535 / intensities[:, None, None]).mean(axis=-1).reshape(len(photographs), -1).T)
+    return np.asarray(
+        (photographs / 65535 / intensities[:, None, None])
+        .mean(axis=-1)
+        .reshape(len(photographs), -1)
+        .T
+    )
 
 
 def test_observations_mask_and_ground_truth(capture_folder, write_image, photographs):
     capture = read_capture(capture_folder)
-    np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6)
+    np.testing.assert_allclose(
+        capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6
+    )
     assert capture.observations.dtype == np.float32
-    assert (capture.name, capture.light_indices, capture.ground_truth) == ("vase", (0, 1, 2, 3), None)
+    assert (capture.name, capture.light_indices, capture.ground_truth) == (
+        "vase",
+        (0, 1, 2, 3),
+        None,
+    )
     assert (capture.warnings, capture.mask.shape, capture.mask.all()) == ((), (5, 6), True)
     np.testing.assert_allclose(capture.light_directions, LIGHTS)
     np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
@@ -62,21 +75,32 @@ def test_observations_mask_and_ground_truth(capture_folder, write_image, photogr
     np.save(capture_folder / "normals_gt.npy", normals)
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.mask, mask)
-    np.testing.assert_allclose(capture.observations, expected(photographs, INTENSITIES)[mask.ravel()], rtol=1e-6)
+    np.testing.assert_allclose(
+        capture.observations, expected(photographs, INTENSITIES)[mask.ravel()], rtol=1e-6
+    )
     np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
 
 
-def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
+def test_only_the_chosen_images_are_read(
+    capture_folder: Path, photographs: NDArray[np.uint16]
+) -> None:
     (capture_folder / "img9.png").write_bytes(b"damaged")
     calls: list[int] = []
     source = open_capture(capture_folder)
     assert source.n_lights == 4
-    assert [path.name for path in source.files.images] == ["img8.png", "img9.png", "img10.png", "img11.png"]
+    assert [path.name for path in source.files.images] == [
+        "img8.png",
+        "img9.png",
+        "img10.png",
+        "img11.png",
+    ]
     capture = source.read([3, 0, 2], progress=lambda: calls.append(1))
     assert len(calls) == 3
     assert capture.light_indices == (3, 0, 2)
     np.testing.assert_allclose(capture.light_directions, LIGHTS[[3, 0, 2]])
-    np.testing.assert_allclose(capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6)
+    np.testing.assert_allclose(
+        capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6
+    )
     with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF, .* nor HEIC"):
         source.read()
 
@@ -89,7 +113,10 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(capture_folder
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
     (warning,) = texts(capture.warnings)
-    assert warning.startswith("50.0 % of the pixels are black") and "Leave them out with a mask or" in warning
+    assert (
+        warning.startswith("50.0 % of the pixels are black")
+        and "Leave them out with a mask or" in warning
+    )
     (capture_folder / "mask.png").unlink()
     with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
         read_capture(capture_folder)
@@ -112,23 +139,39 @@ def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
             write_image(f"vase/img{number}.png", pixels)
         found = texts(read_capture(capture_folder).warnings)
         assert len(found) == (share is not None)
-        assert all(text.startswith(f"{share} % of the pixels are black under every light") for text in found)
+        assert all(
+            text.startswith(f"{share} % of the pixels are black under every light")
+            for text in found
+        )
 
 
 @pytest.mark.parametrize(
-    ("name", "n_pixels", "mae_deg"), [("ballPNG", 15791, 4.29), ("catPNG", 45200, 8.45)]
-)  # the errors: the README beside the data; 0.02 for their rounding and the light files' four decimals
-def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, mae_deg: float) -> None:
+    ("name", "n_pixels", "mae_deg"),
+    [("ballPNG", 15791, 4.29), ("catPNG", 45200, 8.45)],
+    # the errors: the README beside the data; 0.02 for their rounding and the light files' four
+    # decimals
+)
+def test_least_squares_on_diligent(
+    shared_data: Path, name: str, n_pixels: int, mae_deg: float
+) -> None:
     capture = read_capture(shared_data / "DiLiGenT/pmsData" / name, as_stored=True)
     assert (capture.name, capture.observations.shape) == (name, (n_pixels, 96))
-    solution = np.linalg.lstsq(capture.light_directions, capture.observations.T.astype(np.float64), rcond=None)[0]
+    solution = np.linalg.lstsq(
+        capture.light_directions, capture.observations.T.astype(np.float64), rcond=None
+    )[0]
     truth = capture.ground_truth[capture.mask]
     scored = truth.any(axis=1)
-    assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(mae_deg, abs=0.02)
+    assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(
+        mae_deg, abs=0.02
+    )
 
 
-@pytest.mark.parametrize(("scale", "spread", "warned"), [(1, 0.3, False), (600, 0, False), (200, 0.3, True)])
-def test_positions_given_as_directions_are_named(tmp_path: Path, scale: float, spread: float, warned: bool) -> None:
+@pytest.mark.parametrize(
+    ("scale", "spread", "warned"), [(1, 0.3, False), (600, 0, False), (200, 0.3, True)]
+)
+def test_positions_given_as_directions_are_named(
+    tmp_path: Path, scale: float, spread: float, warned: bool
+) -> None:
     """Vectors of one length, or of about 1, are directions."""
     lights = ring_lights(8) * scale * (1 + spread * np.linspace(0, 1, 8)[:, None])
     folder = write_capture(tmp_path / "a", np.full((8, 4, 5), 100, np.uint8), lights)
@@ -143,8 +186,14 @@ MASK = np.array([[True, False, True], [True, True, False]])
 
 
 def make(**changes: Any) -> Capture:
-    fields: dict[str, Any] = {"name": "vase", "observations": np.arange(16).reshape(4, 4), "mask": MASK}
-    return Capture(**(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes))
+    fields: dict[str, Any] = {
+        "name": "vase",
+        "observations": np.arange(16).reshape(4, 4),
+        "mask": MASK,
+    }
+    return Capture(
+        **(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes)
+    )
 
 
 def test_positions_that_cannot_be_meant() -> None:
@@ -163,16 +212,25 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"observations": np.zeros((5, 4))}, r"observations of shape \(5, 4\), expected .* = \(4, 4\)"),
+        (
+            {"observations": np.zeros((5, 4))},
+            r"observations of shape \(5, 4\), expected .* = \(4, 4\)",
+        ),
         ({"observations": np.full((4, 4), np.nan)}, "an observation is not finite"),
-        ({"light_directions": LIGHTS[:, :2]}, r"light directions of shape \(4, 2\), expected \(F, 3\)"),
+        (
+            {"light_directions": LIGHTS[:, :2]},
+            r"light directions of shape \(4, 2\), expected \(F, 3\)",
+        ),
         ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
         ({"light_directions": LIGHTS * 1.01}, "a light direction is not a unit vector"),
         ({"light_directions": LIGHTS * np.nan}, "a light direction is not finite"),
         ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 is below the horizon \(z <= 0\)"),
         ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
         ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
-        ({"ground_truth": np.zeros((3, 2, 3))}, r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)"),
+        (
+            {"ground_truth": np.zeros((3, 2, 3))},
+            r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)",
+        ),
         ({"ground_truth": np.full((2, 3, 3), 0.1)}, NO_NORMAL),
         ({"ground_truth": np.full((2, 3, 3), np.nan)}, NO_NORMAL),
     ],
@@ -191,7 +249,9 @@ def test_restored_observations_follow_the_choice() -> None:
     np.testing.assert_array_equal(chosen.observations, capture.observations[[0, 3]])
     np.testing.assert_array_equal(chosen.mask, [[True, False, False], [False, True, False]])
     assert make().choose_lights([0, 1, 2]).restored is None
-    with pytest.raises(InputError, match=r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"):
+    with pytest.raises(
+        InputError, match=r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"
+    ):
         make(restored=restored[:, :3])
 
 
@@ -204,7 +264,9 @@ def stderr_is_apart(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_all_come_in_their_order(stderr_is_apart: bool, count: int) -> None:
-    assert list(read_ahead(lambda item: 10 * item, range(count))) == [10 * item for item in range(count)]
+    assert list(read_ahead(lambda item: 10 * item, range(count))) == [
+        10 * item for item in range(count)
+    ]
 
 
 def test_the_next_item_is_read_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:

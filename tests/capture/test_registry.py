@@ -1,4 +1,6 @@
-"""Which files of a folder are taken for what; stamps change with every file of a capture, and only then."""
+"""Which files of a folder are taken for what; stamps change with every file of a capture, and only
+then.
+"""
 
 import os
 from pathlib import Path
@@ -8,7 +10,13 @@ import pytest
 
 from capture.conftest import WriteImage
 from scenes import write_capture
-from splinecli.capture import Overrides, RadiometricCalibration, find_capture_files, find_captures, open_capture
+from splinecli.capture import (
+    Overrides,
+    RadiometricCalibration,
+    find_capture_files,
+    find_captures,
+    open_capture,
+)
 from splinecli.capture.files import digest
 from splinecli.errors import InputError
 
@@ -26,10 +34,17 @@ def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
     folder = fill(
         tmp_path / "vase",
         "img10.png img2.PNG img1.png Img3.tif img04.jpeg notes.txt ._img1.png img5.exr sub/img6.png"
-        " lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png normals.png error_map.png",
+        " lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png normals.png"
+        " error_map.png",
     )
     files = find_capture_files(folder)
-    assert [path.name for path in files.images] == ["img1.png", "img2.PNG", "Img3.tif", "img04.jpeg", "img10.png"]
+    assert [path.name for path in files.images] == [
+        "img1.png",
+        "img2.PNG",
+        "Img3.tif",
+        "img04.jpeg",
+        "img10.png",
+    ]
     assert (files.name, files.folder) == ("vase", folder)
     assert files.light_directions == folder / "lights.txt"
     assert files.light_intensities == folder / "light_intensities.txt"
@@ -38,7 +53,10 @@ def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
 
 
 def test_diligent_and_the_order_of_filenames_txt(tmp_path: Path) -> None:
-    fill(tmp_path, "001.png 002.png 003.png light_directions.txt light_intensities.txt mask.png normal.txt")
+    fill(
+        tmp_path,
+        "001.png 002.png 003.png light_directions.txt light_intensities.txt mask.png normal.txt",
+    )
     (tmp_path / "filenames.txt").write_text("002.png\r\n\r\n001.png\r\n", encoding="utf-8-sig")
     files = find_capture_files(tmp_path)
     assert files.images == (tmp_path / "002.png", tmp_path / "001.png")
@@ -49,7 +67,9 @@ def test_diligent_and_the_order_of_filenames_txt(tmp_path: Path) -> None:
 
 
 def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
-    folder = fill(tmp_path / "vase", "a.png b.png outline.png gt.tif lights.txt mask.png normal_gt.npy")
+    folder = fill(
+        tmp_path / "vase", "a.png b.png outline.png gt.tif lights.txt mask.png normal_gt.npy"
+    )
     fill(tmp_path, "other.txt brightness.txt")
     given = {"lights": tmp_path / "other.txt", "intensities": tmp_path / "brightness.txt"}
     given |= {"mask": folder / "outline.png", "ground_truth": folder / "gt.tif"}
@@ -66,10 +86,26 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     for name, overrides, message in (
         ("nowhere", Overrides(), r"nowhere: the folder does not exist\."),
         ("file", Overrides(), r"found a file, expected a folder of images\."),
-        ("empty", Overrides(), r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA,"),
-        ("dataset", Overrides(), r"no images\. There are captures in .*dataset, such as .*a: give these"),
-        ("dark", Overrides(), r"2 images but no light file \(light_directions.txt, .*Pass --lights FILE"),
-        ("dark", Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"), r"none\.png: the file does"),
+        (
+            "empty",
+            Overrides(),
+            r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA,",
+        ),
+        (
+            "dataset",
+            Overrides(),
+            r"no images\. There are captures in .*dataset, such as .*a: give these",
+        ),
+        (
+            "dark",
+            Overrides(),
+            r"2 images but no light file \(light_directions.txt, .*Pass --lights FILE",
+        ),
+        (
+            "dark",
+            Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"),
+            r"none\.png: the file does",
+        ),
         ("dark", Overrides(lights=tmp_path), r"found a folder, expected a file\."),
     ):
         with pytest.raises(InputError, match=message):
@@ -80,7 +116,10 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
 def test_wrong_filenames_txt(tmp_path: Path) -> None:
     fill(tmp_path, "a.png lights.txt")
     for text, message in (
-        ("a.png\n\nb.png\n", r':3: the image "b.png" does not exist\. Correct the name or remove the line\.'),
+        (
+            "a.png\n\nb.png\n",
+            r':3: the image "b.png" does not exist\. Correct the name or remove the line\.',
+        ),
         ("x" * 300, ':1: the image "x{300}" does not exist'),
         ("a.png\na.png\n", r':2: the image "a.png" is also on line 1\.'),
         ("\n\n", r": the list names no images\."),
@@ -100,8 +139,14 @@ def test_find_captures(tmp_path: Path) -> None:
 def test_find_captures_finds_none(tmp_path: Path) -> None:
     fill(tmp_path, "set/o1/a.png set/o1/lights.txt empty/notes.txt")
     for name, message in (
-        (".", r"found no capture, expected folders .*There are captures in .*set: give that folder\."),
-        ("empty", r"empty: found no capture, expected folders of images with a light file \(.*\)\.$"),
+        (
+            ".",
+            r"found no capture, expected folders .*There are captures in .*set: give that folder\.",
+        ),
+        (
+            "empty",
+            r"empty: found no capture, expected folders of images with a light file \(.*\)\.$",
+        ),
         ("nowhere", "the folder does not exist"),
     ):
         with pytest.raises(InputError, match=message):
@@ -121,8 +166,15 @@ def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
     folder = fill(tmp_path / "vase", "a.png lights.txt")
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    for path, reason in ((tmp_path / ("x" * 300), "File name too long"), (loop, "Too many levels of symbolic links")):
-        for call in (find_capture_files, find_captures, lambda p: find_capture_files(folder, Overrides(lights=p))):
+    for path, reason in (
+        (tmp_path / ("x" * 300), "File name too long"),
+        (loop, "Too many levels of symbolic links"),
+    ):
+        for call in (
+            find_capture_files,
+            find_captures,
+            lambda p: find_capture_files(folder, Overrides(lights=p)),
+        ):
             with pytest.raises(InputError, match=rf"{path.name}: cannot be read \({reason}\)\.$"):
                 call(path)
     (folder / "loop.png").symlink_to(folder / "loop.png")
@@ -130,7 +182,13 @@ def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
         find_capture_files(folder)
 
 
-OTHERS = ("light_directions.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png")
+OTHERS = (
+    "light_directions.txt",
+    "light_intensities.txt",
+    "mask.png",
+    "normals_gt.npy",
+    "ambient.png",
+)
 
 
 @pytest.fixture
@@ -138,11 +196,19 @@ def folder(tmp_path: Path, write_image: WriteImage) -> Path:
     """A capture with every kind of file."""
     write_image("vase/ambient.png", np.full((4, 5), 100, np.uint16))
     write_image("flat.png", np.full((4, 5), 60_000, np.uint16))
-    images = np.full((3, 4, 5), 500, np.uint16) + 1000 * np.arange(3, dtype=np.uint16)[:, None, None]
+    images = (
+        np.full((3, 4, 5), 500, np.uint16) + 1000 * np.arange(3, dtype=np.uint16)[:, None, None]
+    )
     lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
     mask, normals = np.ones((4, 5), bool), np.tile(np.float32((0, 0, 1)), (4, 5, 1))
     return write_capture(
-        tmp_path / "vase", images, lights, mask=mask, normals=normals, intensities=np.ones((3, 3)), names="{}.png"
+        tmp_path / "vase",
+        images,
+        lights,
+        mask=mask,
+        normals=normals,
+        intensities=np.ones((3, 3)),
+        names="{}.png",
     )
 
 
@@ -160,7 +226,9 @@ def test_images_are_stamped_by_their_time(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_other_files_are_stamped_by_their_content(folder: Path, name: str, write_image: WriteImage) -> None:
+def test_other_files_are_stamped_by_their_content(
+    folder: Path, name: str, write_image: WriteImage
+) -> None:
     before = stamp(folder)
     content = (folder / name).read_bytes()
     os.utime(folder / name, ns=(1, 1))

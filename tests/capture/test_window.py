@@ -41,7 +41,9 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     # Sums over the colours may round differently.
     expected = window.of(on_image(whole.mask, whole.observations))[part.mask]
     np.testing.assert_allclose(part.observations, expected, rtol=1e-6)
-    described = describe_capture(InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale))
+    described = describe_capture(
+        InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale)
+    )
     assert (described["n_pixels"], described["reads"]) == (part.n_pixels, window.in_words())
 
 
@@ -67,11 +69,15 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str | None, tmp_path: Path) -> None:
+def test_results_are_a_part_of_those_of_the_whole(
+    crop: str | None, scale: str | None, tmp_path: Path
+) -> None:
     maps = {}
     for name, options in (("whole", (None, None)), ("part", (crop, scale))):
         crop_and_scale = dict(zip(("crop", "scale"), options, strict=True))
-        record = InferOptions(method="ls", maps=("albedo",), output=str(tmp_path / name), **crop_and_scale)
+        record = InferOptions(
+            method="ls", maps=("albedo",), output=str(tmp_path / name), **crop_and_scale
+        )
         report = infer_capture(MEDALLION, record)
         assert (report["options"]["crop"], report["options"]["scale"]) == options
         folder = tmp_path / name / "medallion"
@@ -81,7 +87,10 @@ def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str |
 
 
 def test_windows_in_words() -> None:
-    assert parse_window(*WINDOWS[2]).in_words() == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+    assert (
+        parse_window(*WINDOWS[2]).in_words()
+        == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+    )
     assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
@@ -96,7 +105,9 @@ def test_windows_in_words() -> None:
         (None, "0.5", "--scale is"),
     ],
 )
-def test_values_that_mean_nothing_are_refused(crop: str | None, scale: str | None, problem: str) -> None:
+def test_values_that_mean_nothing_are_refused(
+    crop: str | None, scale: str | None, problem: str
+) -> None:
     with pytest.raises(UsageError, match=problem):
         InferOptions(crop=crop, scale=scale)
 
@@ -123,9 +134,14 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
         lit = lighting_on(capture)(None, np.arange(capture.n_pixels)) if not near else None
         if near:
             places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
-            points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
+            points = surface_points(
+                capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps))
+            )
             lit = PixelLighting.of(capture.observations, replace(capture.lamps, points=points))
-        values = (lit.directions.reshape(capture.n_pixels, -1), capture.observations if not near else lit.observations)
+        values = (
+            lit.directions.reshape(capture.n_pixels, -1),
+            capture.observations if not near else lit.observations,
+        )
         images.append(on_image(capture.mask, np.concatenate(values, axis=1)))
     whole, part = images
     np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
@@ -135,13 +151,18 @@ def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
     options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
     with pytest.raises(SplinecliError, match="--object-width needs the whole object in the image"):
         options.open(MEDALLION)
-    narrow = InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    narrow = (
+        InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    )
     wide = InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION).read()
     assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
 
 
 def test_the_camera_of_the_part_sees_the_same_rays() -> None:
-    window, matrix = Window((2, 1, 5, 4), 2, (7, 9)), np.array([(90, 1, 3.5), (0, 80, 2.5), (0, 0, 1)])
+    window, matrix = (
+        Window((2, 1, 5, 4), 2, (7, 9)),
+        np.array([(90, 1, 3.5), (0, 80, 2.5), (0, 0, 1)]),
+    )
     whole = pixel_rays(np.ones((7, 9), np.bool_), matrix).reshape(7, 9, 3)
     part = pixel_rays(np.ones((2, 3), np.bool_), window.camera(matrix)).reshape(2, 3, 3)
     np.testing.assert_allclose(part, window.of(whole), atol=1e-12)

@@ -21,8 +21,17 @@ from splinecli.maths.normals import unit
 
 SIZE = 24
 LIGHTS = np.array(
-    [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0, -0.5, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1), (0.4, -0.4, 1)]
-)  # fmt: skip
+    [
+        (0, 0, 1),
+        (0.5, 0, 1),
+        (-0.5, 0, 1),
+        (0, 0.5, 1),
+        (0, -0.5, 1),
+        (0.4, 0.4, 1),
+        (-0.4, 0.4, 1),
+        (0.4, -0.4, 1),
+    ]
+)
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
 
 
@@ -33,7 +42,9 @@ def in_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def sphere_normals() -> np.ndarray:
-    """Normals (SIZE, SIZE, 3) of the upper part of a matte sphere, which no light above leaves in shadow."""
+    """Normals (SIZE, SIZE, 3) of the upper part of a matte sphere, which no light above leaves in
+    shadow.
+    """
     x, y = scenes.square_grid(SIZE, 1 - 1 / SIZE)
     return unit(np.stack((x, y, np.full_like(x, 2.5)), axis=-1))
 
@@ -44,7 +55,9 @@ def write_capture(folder: Path) -> Path:
     pictures = np.rint(np.moveaxis(normals @ lights.T, 2, 0) * 60_000).astype(np.uint16)
     disc = np.hypot(*scenes.square_grid(SIZE, 1 - 1 / SIZE)) < 1
     truth = normals.astype(np.float32)
-    return scenes.write_capture(folder, pictures, lights, mask=disc, normals=truth, names="image{}.png", first=1)
+    return scenes.write_capture(
+        folder, pictures, lights, mask=disc, normals=truth, names="image{}.png", first=1
+    )
 
 
 @pytest.fixture(scope="session")
@@ -101,7 +114,9 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> C
 
 @pytest.fixture
 def document(run: Callable[..., Run]) -> Callable[..., Any]:
-    """Run a command with --json, which must succeed, and return its document: that of the only capture of `infer`."""
+    """Run a command with --json, which must succeed, and return its document: that of the only
+    capture of `infer`.
+    """
 
     def call(command: str, *args: object) -> Any:
         result = run(command, *args, "--json")
@@ -114,14 +129,18 @@ def document(run: Callable[..., Run]) -> Callable[..., Any]:
 
 @pytest.fixture
 def refuse(run: Callable[..., Run], golden: Callable[[str, str], None]) -> Callable[..., None]:
-    """Run a command with arguments that it must refuse, (exit code, arguments), and compare all its messages."""
+    """Run a command with arguments that it must refuse, (exit code, arguments), and compare all its
+    messages.
+    """
 
     def check(command: str, cases: Iterable[tuple[int, list[object]]], name: str) -> None:
         messages = []
         for code, arguments in cases:
             result = run(command, *arguments)
             assert (result.code, result.out) == (code, ""), (arguments, result.err)
-            messages.append(re.sub("[0-9a-f]{16}", "<checksum>", result.err.replace(f"{Path.cwd()}/", "")))
+            messages.append(
+                re.sub("[0-9a-f]{16}", "<checksum>", result.err.replace(f"{Path.cwd()}/", ""))
+            )
         golden(name, "".join(messages))
 
     return check

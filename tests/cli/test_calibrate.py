@@ -21,7 +21,9 @@ def normals():
 
 
 def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
-    """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and light."""
+    """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and
+    light.
+    """
     folder.mkdir()
     n, inside = normals()
     for number, half in enumerate(halfway(lights)):
@@ -33,8 +35,15 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
 
 def write_gray(folder: Path, intensities) -> Path:
     n, inside = normals()
-    images = 0.5 * np.array(intensities)[:, None, None] * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1) * inside
-    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png")
+    images = (
+        0.5
+        * np.array(intensities)[:, None, None]
+        * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1)
+        * inside
+    )
+    return write_capture(
+        folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png"
+    )
 
 
 def angles_deg(found, expected=LIGHTS):
@@ -57,8 +66,13 @@ def test_an_outline_given_by_the_user(document):
     write_balls(Path("ball"))
     report = document("calibrate", "ball", "--circle", "60,48,40", "-o", "out")
     assert report["balls"][0]["circle"] == {
-        "x": 60.0, "y": 48.0, "radius": 40.0, "from": "--circle", "seen": 1.0, "spread": 0.0,
-    }  # fmt: skip
+        "x": 60.0,
+        "y": 48.0,
+        "radius": 40.0,
+        "from": "--circle",
+        "seen": 1.0,
+        "spread": 0.0,
+    }
     assert angles_deg(np.array(report["light_directions"])).max() < 0.6
     assert report["disagreement_deg"] is None
     assert json.loads(Path("out/calibration.json").read_text()) == report
@@ -77,7 +91,16 @@ def test_positions_need_the_camera(run):
     assert not Path("calibration/light_positions.txt").exists()
     matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))
     np.savetxt("matrix.txt", matrix)
-    arguments = ["calibrate", "one", "two", *circles, "--overwrite", "--json", "--camera-matrix", "matrix.txt"]
+    arguments = [
+        "calibrate",
+        "one",
+        "two",
+        *circles,
+        "--overwrite",
+        "--json",
+        "--camera-matrix",
+        "matrix.txt",
+    ]
     report = json.loads(run(*arguments).out)
     assert report["camera"] == {"from": "--camera-matrix", "matrix": matrix.tolist()}
     known = report["lamp_positions"]["known"]
@@ -93,7 +116,10 @@ def test_the_normals_are_not_the_lights(run):
     np.savetxt("mistake.txt", halfway(LIGHTS))
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
     assert result.code == 0 and "the compared file differs by 13." in result.err
-    assert "warning: The compared file contains the normals of the ball at the highlights" in result.err
+    assert (
+        "warning: The compared file contains the normals of the ball at the highlights"
+        in result.err
+    )
 
 
 def test_an_uncertain_outline(run):

@@ -1,4 +1,6 @@
-"""Warnings about a capture, its mask and its values, from the files to the messages of `infer` and `info`."""
+"""Warnings about a capture, its mask and its values, from the files to the messages of `infer` and
+`info`.
+"""
 
 import json
 import shutil
@@ -26,7 +28,9 @@ def codes() -> list[str]:
 
 
 def refused(run, *command: object) -> str:
-    """Run infer with --strict, which must refuse the capture and write nothing; return the message."""
+    """Run infer with --strict, which must refuse the capture and write nothing;
+    return the message.
+    """
     result = run("infer", "medallion", *command, "--strict", "-o", "refused")
     assert (result.code, result.out) == (3, "")
     assert not Path("refused/medallion").exists()
@@ -36,7 +40,10 @@ def refused(run, *command: object) -> str:
 def test_shifted_images_are_named(run, medallion):
     move(medallion / "04.png", 2, -1)
     move(medallion / "09.png", 0, 4)
-    words = "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4 down."
+    words = (
+        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4"
+        " down."
+    )
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0 and words in result.err
     assert "images_shifted" in codes()
@@ -46,11 +53,16 @@ def test_shifted_images_are_named(run, medallion):
 
 
 def test_the_same_file_under_two_lights(run, medallion):
-    """Each colour of the medallion has its own intensity, so equal files give unequal observations."""
+    """Each colour of the medallion has its own intensity, so equal files give unequal
+    observations.
+    """
     for copy, original in (("02", "01"), ("07", "03")):
         shutil.copy(medallion / f"{original}.png", medallion / f"{copy}.png")
     result = run("infer", medallion, "--method", "ls")
-    words = "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove one,"
+    words = (
+        "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove"
+        " one,"
+    )
     assert result.code == 0 and words in result.err
     assert codes() == ["repeated_images"]
     assert words.removesuffix(" Remove one,") in refused(run, "--method", "ls")
@@ -66,16 +78,25 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     normals = picture / np.iinfo(picture.dtype).max * 2 - 1
     np.save(medallion / "normals_gt.npy", normals * signs)
     result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0 and f"degrees with {negated} negated: it is probably in this frame" in result.err
+    assert (
+        result.code == 0
+        and f"degrees with {negated} negated: it is probably in this frame" in result.err
+    )
     assert codes() == [code]
     assert f"with {negated} negated" in refused(run, "--method", "ls")
     evaluation = run("evaluate", medallion, "--method", "ls", "--n-lights", 8, "--trials", 1)
-    assert f"degrees with {negated} negated: it is probably in this frame" in evaluation.out + evaluation.err
+    assert (
+        f"degrees with {negated} negated: it is probably in this frame"
+        in evaluation.out + evaluation.err
+    )
 
 
 def test_lights_that_crowd(run, medallion):
     given = np.loadtxt(medallion / "light_directions.txt")
-    for change, words in (((0.1, 0.1, 1), "are in a narrow cone"), ((1, 0.05, 1), "are nearly in one plane")):
+    for change, words in (
+        ((0.1, 0.1, 1), "are in a narrow cone"),
+        ((1, 0.05, 1), "are nearly in one plane"),
+    ):
         np.savetxt(medallion / "light_directions.txt", given * change)
         assert f"All lights {words}" in run("info", medallion).err
     run("infer", medallion, "--method", "ls")
@@ -83,7 +104,9 @@ def test_lights_that_crowd(run, medallion):
 
 
 def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
-    """Noise in place of photographs, on an object of few pixels. The usual limit is nearer to what the network says."""
+    """Noise in place of photographs, on an object of few pixels. The usual limit is nearer to what
+    the network says.
+    """
     monkeypatch.setattr(checks, "LEAST_EXPECTED", 0.3)
     rng = np.random.default_rng(0)
     for path in medallion.glob("[01]*.png"):
@@ -104,9 +127,16 @@ def test_python_gives_the_same_warnings(medallion):
     lights *= (1, -1, 1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        estimate = splinecli.estimate_normals(images, lights, mask, light_intensities=intensities, method="ls")
-    assert [warning.code for warning in estimate.capture.warnings] == ["images_shifted", "light_frame"]
-    assert [str(warning.message) for warning in caught] == [str(w) for w in estimate.capture.warnings]
+        estimate = splinecli.estimate_normals(
+            images, lights, mask, light_intensities=intensities, method="ls"
+        )
+    assert [warning.code for warning in estimate.capture.warnings] == [
+        "images_shifted",
+        "light_frame",
+    ]
+    assert [str(warning.message) for warning in caught] == [
+        str(w) for w in estimate.capture.warnings
+    ]
     assert all(warning.filename == __file__ for warning in caught)
     assert "images[3] 2 right 1 up" in str(caught[0].message)
     assert "run again with --light-frame y-down" in str(caught[1].message)
@@ -118,8 +148,13 @@ LIGHTS = spiral_lights(10, 55, 12)
 def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Images (F, H, W) from 0 to 1 of a ball before a plane of this brightness, and its mask."""
     normals, mask = sphere(80)
-    normals, mask = (np.pad(array, ((16, 16), (16, 16), *((0, 0),) * (array.ndim - 2))) for array in (normals, mask))
-    plane = background * np.random.default_rng(1).uniform(0.6, 1, mask.shape)[..., None] * LIGHTS[:, 2]
+    normals, mask = (
+        np.pad(array, ((16, 16), (16, 16), *((0, 0),) * (array.ndim - 2)))
+        for array in (normals, mask)
+    )
+    plane = (
+        background * np.random.default_rng(1).uniform(0.6, 1, mask.shape)[..., None] * LIGHTS[:, 2]
+    )
     images = np.where(mask[..., None], 0.7 * shade(normals, LIGHTS, noise=0.002), plane)
     return np.moveaxis(images, 2, 0), mask
 
@@ -149,7 +184,9 @@ def test_an_inverted_mask(run, background):
 def test_a_mask_around_a_dark_hole_is_right(run):
     images, mask = ball(background=0.6)
     images[:, mask] *= 0.02
-    assert "mask_inverted" not in codes_of(run, write_capture(Path("frame"), stored(images), LIGHTS, mask=~mask))
+    assert "mask_inverted" not in codes_of(
+        run, write_capture(Path("frame"), stored(images), LIGHTS, mask=~mask)
+    )
 
 
 def test_twelve_bits_in_files_of_sixteen(run):
@@ -157,7 +194,10 @@ def test_twelve_bits_in_files_of_sixteen(run):
     folder = write_capture(Path("twelve"), stored(images, 4095), LIGHTS, mask=mask)
     result = run("info", folder, "--json")
     assert json.loads(result.out)["warning_codes"] == ["white_level"]
-    assert "as from a camera of 12 bits in 16-bit files" in result.err and "--white-level 4095" in result.err
+    assert (
+        "as from a camera of 12 bits in 16-bit files" in result.err
+        and "--white-level 4095" in result.err
+    )
     assert codes_of(run, folder, "--white-level", 4095) == []
 
 
@@ -176,7 +216,10 @@ def test_one_file_of_another_scale(run, others):
     folder = write_capture(Path("mixed"), values, LIGHTS, mask=mask)
     assert "image_scale" in codes_of(run, folder)
     result = run("infer", folder, "--method", "ls", "--strict")
-    assert result.code == 3 and "004.png is 16 times " + ("brighter" if others else "darker") in result.err
+    assert (
+        result.code == 3
+        and "004.png is 16 times " + ("brighter" if others else "darker") in result.err
+    )
     picture = cv2.imread(str(folder / "004.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(folder / "004.png"), picture // 16 if others else picture * np.uint16(16))
     assert "image_scale" not in codes_of(run, folder)

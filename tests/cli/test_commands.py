@@ -1,4 +1,6 @@
-"""What all commands share: panels in the help, `~` in paths, closed pipes, progress, and threads that sleep."""
+"""What all commands share: panels in the help, `~` in paths, closed pipes, progress, and threads
+that sleep.
+"""
 
 import contextlib
 import errno
@@ -20,7 +22,9 @@ from splinecli.records.base import PANELS
 
 def test_every_option_stands_in_a_panel():
     commands = typer.main.get_command(app).commands.values()
-    options = [one for command in commands for one in command.params if one.param_type_name == "option"]
+    options = [
+        one for command in commands for one in command.params if one.param_type_name == "option"
+    ]
     assert {option.rich_help_panel for option in options} <= set(PANELS)
 
 
@@ -50,8 +54,21 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
     Path("third/image3.png").write_bytes(b"no picture")
     read, write = os.pipe()
     os.close(read)
-    arguments = [sys.executable, "-u", "-m", "splinecli", "infer", str(capture), "third", "second", "--method", "ls"]
-    done = subprocess.run(arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True)
+    arguments = [
+        sys.executable,
+        "-u",
+        "-m",
+        "splinecli",
+        "infer",
+        str(capture),
+        "third",
+        "second",
+        "--method",
+        "ls",
+    ]
+    done = subprocess.run(
+        arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True
+    )
     os.close(write)
     assert done.returncode == 3
     assert {path.name for path in Path("out").iterdir()} == {"index.html", "second", "sphere"}
@@ -60,11 +77,17 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
 
 
 @pytest.mark.parametrize("name", ["infer", "info", "calibrate", "integrate", "evaluate", "prepare"])
-@pytest.mark.parametrize("wrong", ["nowhere", "--magic", "--output", ""], ids=lambda text: text or "no argument")
+@pytest.mark.parametrize(
+    "wrong", ["nowhere", "--magic", "--output", ""], ids=lambda text: text or "no argument"
+)
 def test_a_failure_is_a_json_document(name, wrong, run):
-    """A capture that cannot be read, an unknown option, an option without a value, and no argument."""
+    """A capture that cannot be read, an unknown option, an option without a value,
+    and no argument.
+    """
     missing = wrong == "nowhere"
-    result = run(name, "--json", *wrong.split(), *(("-o", "set") if missing and name == "prepare" else ()))
+    result = run(
+        name, "--json", *wrong.split(), *(("-o", "set") if missing and name == "prepare" else ())
+    )
     document = json.loads(result.out)
     if name == "infer":
         (document,) = document
@@ -72,13 +95,22 @@ def test_a_failure_is_a_json_document(name, wrong, run):
         check(document, "Failure")
     if name == "infer":
         assert document.pop("capture") == (wrong if missing else None)
-    assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": result.code}
-    assert (result.code, result.err.count("\n"), "nowhere" in result.err) == (3 if missing else 2, 1, missing)
+    assert document == {
+        "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
+        "exit_code": result.code,
+    }
+    assert (result.code, result.err.count("\n"), "nowhere" in result.err) == (
+        3 if missing else 2,
+        1,
+        missing,
+    )
     assert run(name, "--magic").out == ""
 
 
 @pytest.mark.parametrize(("command", "skipped"), [("evaluate", "capture"), ("prepare", "source")])
-def test_a_subfolder_without_permission_is_skipped(command, skipped, make_capture, run_without_privileges):
+def test_a_subfolder_without_permission_is_skipped(
+    command, skipped, make_capture, run_without_privileges
+):
     for name in ("set/a", "set/b", "set/c"):
         make_capture(name)
     Path("set/b").chmod(0)
@@ -98,16 +130,25 @@ def test_a_subfolder_without_permission_is_skipped(command, skipped, make_captur
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expected):
     script = "import os; from splinecli.cli.main import main; main(['--version']); "
     script += "print(os.environ.get('OMP_WAIT_POLICY'))"
-    clean = {name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    clean = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+    }
     call = [sys.executable, "-c", script]
-    done = subprocess.run(call, capture_output=True, text=True, check=True, env={**clean, **variables})
+    done = subprocess.run(
+        call, capture_output=True, text=True, check=True, env={**clean, **variables}
+    )
     assert done.stdout.splitlines()[-1] == str(expected)
 
 
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
-        (PermissionError(errno.EACCES, "Permission denied", "lights.txt"), ("lights.txt: cannot be read", 3)),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "lights.txt"),
+            ("lights.txt: cannot be read", 3),
+        ),
         (OSError(errno.EIO, "Input/output error"), ("cannot be read (Input/output error)", 3)),
         (OSError(errno.ENOSPC, "No space left on device", "out"), ("out: cannot be written", 5)),
     ],
@@ -139,7 +180,9 @@ def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX terminals")
 def test_the_bar_moves_at_least_twice_a_second_on_a_terminal():
-    """A bar that is advanced every tenth of a second shows at least four percentages in 2.5 seconds."""
+    """A bar that is advanced every tenth of a second shows at least four percentages in 2.5
+    seconds.
+    """
     import pty
 
     script = """

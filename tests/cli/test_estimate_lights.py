@@ -43,19 +43,36 @@ def test_infer(unlit, run, document):
     given = ["--intensities", str(intensities) if intensities.exists() else "equal"]
     lights = ["--lights", "out/ball/light_directions.txt"]
     assert run("infer", unlit, *lights, *given, "--method", "ls", "-o", "again").code == 0
-    np.testing.assert_allclose(np.load("again/ball/normals.npy"), np.load("out/ball/normals.npy"), atol=2e-4)
+    np.testing.assert_allclose(
+        np.load("again/ball/normals.npy"), np.load("out/ball/normals.npy"), atol=2e-4
+    )
 
 
 def test_the_message_about_a_missing_light_file_names_it(unlit, run):
     result = run("infer", unlit)
-    assert result.code == 3 and "--lights estimate" in result.err and "splinecli calibrate" in result.err
+    assert (
+        result.code == 3
+        and "--lights estimate" in result.err
+        and "splinecli calibrate" in result.err
+    )
 
 
 def test_a_light_file_of_the_user_is_kept(unlit, run):
     """Here, the results go into the folder of the capture."""
     own = "\n".join("0 0 1" for _ in LIGHTS)
     (unlit / "light_directions.txt").write_text(own)
-    command = ("infer", unlit, "--lights", "estimate", "--intensities", "equal", "--method", "ls", "-o", ".")
+    command = (
+        "infer",
+        unlit,
+        "--lights",
+        "estimate",
+        "--intensities",
+        "equal",
+        "--method",
+        "ls",
+        "-o",
+        ".",
+    )
     result = run(*command)
     assert result.code == 5 and "not from an earlier run" in result.err
     assert (unlit / "light_directions.txt").read_text() == own
@@ -64,7 +81,12 @@ def test_a_light_file_of_the_user_is_kept(unlit, run):
     # Its own files are replaced, and removed where the lights are no longer estimated.
     assert run(*command, "--overwrite").code == 0
     np.savetxt("given.txt", LIGHTS)
-    assert run("infer", unlit, "--lights", "given.txt", "--method", "ls", "-o", ".", "--overwrite").code == 0
+    assert (
+        run(
+            "infer", unlit, "--lights", "given.txt", "--method", "ls", "-o", ".", "--overwrite"
+        ).code
+        == 0
+    )
     assert not (unlit / "light_directions.txt").exists()
 
 
@@ -78,7 +100,19 @@ def test_info(unlit, run, document):
 def test_evaluate(unlit, run):
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
     (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
-    arguments = ("evaluate", unlit, "--method", "ls", "--n-lights", "8", "--trials", "2", "--json", "-o", "scores")
+    arguments = (
+        "evaluate",
+        unlit,
+        "--method",
+        "ls",
+        "--n-lights",
+        "8",
+        "--trials",
+        "2",
+        "--json",
+        "-o",
+        "scores",
+    )
     given = json.loads(run(*arguments).out)
     result = run(*arguments, "--lights", "estimate")
     estimated = json.loads(result.out)
@@ -96,23 +130,36 @@ def test_first_light(unlit, run):
     crop = ("infer", unlit, "--crop", "16,16,32,32", "--lights", "estimate", "--method", "ls")
     for command in (crop, ("info", unlit, "--crop", "16,16,32,32", "--lights", "estimate")):
         result = run(*command)
-        assert result.code == 3 and result.err.startswith("splinecli: ball: the images do not show the outline")
-    assert "--auto-mask" in result.err and "--first-light left, upper-left, or its azimuth" in result.err
+        assert result.code == 3 and result.err.startswith(
+            "splinecli: ball: the images do not show the outline"
+        )
+    assert (
+        "--auto-mask" in result.err
+        and "--first-light left, upper-left, or its azimuth" in result.err
+    )
     side = str(np.degrees(np.arctan2(LIGHTS[0, 1], LIGHTS[0, 0])))
     assert run(*crop, "--first-light", side).code == 0
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
     result = run("infer", unlit, "--first-light", side)
     assert result.code == 2 and "--first-light needs --lights estimate" in result.err
     result = run(*crop, "--first-light", "north")
-    assert result.code == 2 and "the first light comes from 'north'; expected one of right," in result.err
+    assert (
+        result.code == 2
+        and "the first light comes from 'north'; expected one of right," in result.err
+    )
 
 
 def test_contradictions(unlit, run):
     for command, *options in (
-        ("infer", "--light-distance", "100"), ("infer", "--light-positions", "x.txt"),
-        ("infer", "--light-frame", "x-left"), ("infer", "--light-format", "azel"), ("infer", "--refine-lights"),
-        ("info", "--check-lights"), ("evaluate", "--refine-lights"), ("evaluate", "--light-noise-deg", "2"),
-    ):  # fmt: skip
+        ("infer", "--light-distance", "100"),
+        ("infer", "--light-positions", "x.txt"),
+        ("infer", "--light-frame", "x-left"),
+        ("infer", "--light-format", "azel"),
+        ("infer", "--refine-lights"),
+        ("info", "--check-lights"),
+        ("evaluate", "--refine-lights"),
+        ("evaluate", "--light-noise-deg", "2"),
+    ):
         result = run(command, unlit, *options, "--lights", "estimate")
         assert (result.code, "--lights estimate" in result.err) == (2, True), options
     assert not Path("out").exists()
@@ -133,7 +180,16 @@ def test_a_film(run, document):
     normals = np.load("out/clip/normals.npy")
     assert angle_between_deg(normals[mask], sphere(96)[0][mask]).mean() < 6
     # The frames are a capture of their own, and stay while the film does.
-    document("infer", "out/frames/clip", "--lights", "out/clip/light_directions.txt", "-o", "b", "--method", "ls")
+    document(
+        "infer",
+        "out/frames/clip",
+        "--lights",
+        "out/clip/light_directions.txt",
+        "-o",
+        "b",
+        "--method",
+        "ls",
+    )
     times = [frame.stat().st_mtime_ns for frame in frames]
     assert "already done" in run(*command).err
     assert [frame.stat().st_mtime_ns for frame in frames] == times
@@ -153,7 +209,10 @@ def test_a_film(run, document):
     result = run(*command, "--overwrite")
     assert result.code == 5 and "contains mask.png, which is not a frame" in result.err
     Path("out/frames/clip/mask.png").unlink()
-    assert "from the camera axis" in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
+    assert (
+        "from the camera axis"
+        in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
+    )
 
 
 def test_films_that_cannot_be_used(run):
@@ -161,9 +220,18 @@ def test_films_that_cannot_be_used(run):
     film.with_name("...mp4").write_bytes(film.read_bytes())
     for code, arguments, words in (
         (2, (film,), "Add --lights estimate"),
-        (3, (film, "--lights", "estimate"), "clip.avi: found 1 of 10 frames that are sharp and differ in their light"),
+        (
+            3,
+            (film, "--lights", "estimate"),
+            "clip.avi: found 1 of 10 frames that are sharp and differ in their light",
+        ),
         (3, ("none.mp4", "--lights", "estimate"), "the film does not exist"),
-        (3, ("...mp4", "--lights", "estimate"), ""),  # a name that would lead out of OUT/frames is none of a film
+        # a name that would lead out of OUT/frames is none of a film
+        (
+            3,
+            ("...mp4", "--lights", "estimate"),
+            "",
+        ),
     ):
         result = run("infer", *arguments)
         assert result.code == code and words in result.err

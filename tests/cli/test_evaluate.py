@@ -14,7 +14,9 @@ from splinecli.maths.normals import unit
 
 @pytest.fixture
 def dataset(make_capture):
-    """Two captures; on `shaded` light 1 is shadowed out, so that LS is wrong wherever it is drawn."""
+    """Two captures; on `shaded` light 1 is shadowed out, so that LS is wrong wherever it is
+    drawn.
+    """
     make_capture("data/matte")
     shaded = make_capture("data/shaded")
     cv2.imwrite(str(shaded / "image1.png"), np.zeros((24, 24), np.uint16))
@@ -37,15 +39,22 @@ def test_files_and_table(dataset, run, golden):
 
 @pytest.fixture
 def overexposed(make_capture):
-    """A capture whose lights are unequally bright, which no file says, and whose brightest observations are clipped."""
+    """A capture whose lights are unequally bright, which no file says, and whose brightest
+    observations are clipped.
+    """
     folder = make_capture("overexposed")
     y, x = np.mgrid[0.8:-0.8:24j, -0.8:0.8:24j]
     height = np.sqrt(np.maximum(1 - x**2 - y**2, 0.1))
     normals = unit(np.stack((x, y, height), axis=2))
     intensities = np.array((1.0, 0.8, 1.2, 0.7, 1.3, 0.9, 1.1, 1.0))
-    images = np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1) * 65535
+    images = (
+        np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1)
+        * 65535
+    )
     pictures = np.rint(np.moveaxis(images, 2, 0)).astype(np.uint16)
-    return write_capture(folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1)
+    return write_capture(
+        folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1
+    )
 
 
 @pytest.mark.parametrize("n_lights", ["all", 7])
@@ -57,7 +66,9 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, 
     for policy, reading in (([], "restored"), (["--as-stored"], "as stored")):
         shared = [overexposed, "--method", method, *policy, "--overwrite"]
         report = document("infer", *shared, *lights)
-        evaluation = document("evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1)
+        evaluation = document(
+            "evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1
+        )
         (result,) = evaluation["results"]
         assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
         assert (evaluation["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
@@ -114,14 +125,35 @@ def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
     assert "…" not in wide
 
 
-FILES = ["lights.png", "report.html", "results.csv", "results.json", "table.md", "table.tex", "trials.jsonl"]
+FILES = [
+    "lights.png",
+    "report.html",
+    "results.csv",
+    "results.json",
+    "table.md",
+    "table.tex",
+    "trials.jsonl",
+]
 
 
 def test_every_file_is_there_and_goes_on(dataset, run):
-    arguments = ["evaluate", dataset, "--method", "ls", "--method", "iw12", "--n-lights", 4, "--n-lights", 5]
+    arguments = [
+        "evaluate",
+        dataset,
+        "--method",
+        "ls",
+        "--method",
+        "iw12",
+        "--n-lights",
+        4,
+        "--n-lights",
+        5,
+    ]
     first = run(*arguments, "--trials", 2, "--json")
     assert first.code == 0
-    assert sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == FILES
+    assert (
+        sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == FILES
+    )
     assert "iw12" in Path("evaluation/report.html").read_text()
     kept = Path("evaluation/trials.jsonl").read_text()
     assert len(kept.splitlines()) == 2 * 2 * 2 * 2
@@ -138,12 +170,28 @@ def test_every_file_is_there_and_goes_on(dataset, run):
 
 
 def test_figures(dataset, run):
-    arguments = ["--n-lights", 4, "--trials", 1, "--max-pixels", 30, "--figures", "--pixel", "9,10", "--pixel", "12,5"]
+    arguments = [
+        "--n-lights",
+        4,
+        "--trials",
+        1,
+        "--max-pixels",
+        30,
+        "--figures",
+        "--pixel",
+        "9,10",
+        "--pixel",
+        "12,5",
+    ]
     methods = [f"--method={name}" for name in ("ls", "spline-net-pixelwise", "spline-net")]
     result = run("evaluate", dataset, *methods, *arguments)
     assert result.code == 0
     # The two networks are one: it has one figure of observation maps.
-    names = [f"{name}{suffix}.png" for name in ("matte", "shaded") for suffix in ("", "_observation_maps")]
+    names = [
+        f"{name}{suffix}.png"
+        for name in ("matte", "shaded")
+        for suffix in ("", "_observation_maps")
+    ]
     assert sorted(path.name for path in Path("evaluation/figures").iterdir()) == sorted(names)
     maps = cv2.imread("evaluation/figures/shaded.png")
     assert maps.shape[1] > maps.shape[0]
@@ -163,7 +211,9 @@ def test_all_methods_by_one_word(dataset, run):
     result = run("evaluate", dataset / "matte", *options)
     document = json.loads(result.out)
     assert [scored["method"] for scored in document["results"]] == method_names()
-    assert result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 8.\n"
+    assert (
+        result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 8.\n"
+    )
     assert document["methods"]["cnn-ps"]["weights"]["name"] == "cnn-ps"
     assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
 

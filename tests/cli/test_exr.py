@@ -24,17 +24,23 @@ def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
     options = ("--method", "ls", "--maps", "albedo", "--surface", "--convention", convention)
     assert run("infer", capture, *options, "--format", "exr,png,npy,tiff").code == 0
     out = Path("out/sphere")
-    green = f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+    green = (
+        f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+    )
     header, channels = read(out / "normals.exr")
     assert header["normals"] == f"(n + 1) / 2; {green}"
     picture = cv2.imread(str(out / "normals.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
-    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=2), picture, atol=1e-5)
+    np.testing.assert_allclose(
+        np.stack([channels[name] for name in "RGB"], axis=2), picture, atol=1e-5
+    )
     with Image.open(out / "normals.png") as image:
         assert image.info["normals"] == green
     with tifffile.TiffFile(out / "normals.tiff") as file:
         assert file.pages[0].description == "normals: x right, y up, z to the camera; green is y up"
     _, channels = read(out / "albedo.exr")
-    np.testing.assert_allclose(np.stack([channels[n] for n in "RGB"], axis=2), np.load(out / "albedo.npy"), rtol=1e-3)
+    np.testing.assert_allclose(
+        np.stack([channels[n] for n in "RGB"], axis=2), np.load(out / "albedo.npy"), rtol=1e-3
+    )
     assert channels["R"].dtype == np.float16
     header, channels = read(out / "depth.exr")
     depth = np.load(out / "depth.npy")
@@ -43,9 +49,14 @@ def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
     assert (out / "depth.png").is_file()
 
 
-@pytest.mark.parametrize("command", [("infer", "sphere", "--method", "ls"), ("integrate", "missing.npy")])
+@pytest.mark.parametrize(
+    "command", [("infer", "sphere", "--method", "ls"), ("integrate", "missing.npy")]
+)
 def test_without_the_library_nothing_is_done(capture, run, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     result = run(*command, "--format", "exr")
-    assert result.code == 2 and "EXR files need the package OpenEXR, which is not installed" in result.err
+    assert (
+        result.code == 2
+        and "EXR files need the package OpenEXR, which is not installed" in result.err
+    )
     assert not Path("out/sphere").exists()

@@ -21,7 +21,17 @@ from splinecli.results.pages import INDEX
 from splinecli.workshop.training.config import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-COMMANDS = ["infer", "watch", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
+COMMANDS = [
+    "infer",
+    "watch",
+    "info",
+    "calibrate",
+    "integrate",
+    "evaluate",
+    "prepare",
+    "train",
+    "import-weights",
+]
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
@@ -32,7 +42,9 @@ def test_help_text(command, run, golden):
 
 
 def test_man_pages_are_up_to_date():
-    """Made anew by `python man/make_pages.py`; a page of what is no command any more is to be removed."""
+    """Made anew by `python man/make_pages.py`; a page of what is no command any more is to be
+    removed.
+    """
     found = {path.name: path.read_text("utf-8") for path in (REPOSITORY / "man").glob("*.1")}
     assert found == man_pages()
 
@@ -41,7 +53,9 @@ def test_man_pages_are_up_to_date():
 def test_man_pages_are_typeset_without_warnings():
     for name, page in man_pages().items():
         # -ww: all warnings; -z: no output but those.
-        done = subprocess.run(["groff", "-man", "-ww", "-z"], input=page, capture_output=True, text=True)
+        done = subprocess.run(
+            ["groff", "-man", "-ww", "-z"], input=page, capture_output=True, text=True
+        )
         assert (name, done.returncode, done.stderr) == (name, 0, "")
 
 
@@ -66,7 +80,8 @@ def test_every_command_has_an_example():
 def test_help_and_ls_do_not_import_torch(capture):
     """`infer --method ls` and all help run without torch; help also without OpenCV."""
     script = (
-        "import sys\nfrom splinecli.cli.main import main\nfor line in sys.argv[1:]:\n    code = main(line.split())\n"
+        "import sys\nfrom splinecli.cli.main import main\nfor line in sys.argv[1:]:\n    code ="
+        " main(line.split())\n"
         "    print(code, *sorted({'torch', 'cv2'} & set(sys.modules)), file=sys.stderr)"
     )
     commands = ["--help", "infer --help", "--version", f"infer {capture} --method ls"]
@@ -113,7 +128,11 @@ def words(out: str, shell: str) -> list[str]:
     """What the line's last word may become; of zsh and fish without the help beside it."""
     if shell == "zsh":
         return re.findall(r'^(?:_arguments \'\*: :\(\()?"(.*?)"', out, re.MULTILINE)
-    return out.split() if shell == "bash" else [entry.split("\t")[0] for entry in out.splitlines() if entry]
+    return (
+        out.split()
+        if shell == "bash"
+        else [entry.split("\t")[0] for entry in out.splitlines() if entry]
+    )
 
 
 COMPLETED = {

@@ -1,4 +1,6 @@
-"""What is wrong with files, names and limits gets one line and a documented exit code, and nothing hangs."""
+"""What is wrong with files, names and limits gets one line and a documented exit code, and nothing
+hangs.
+"""
 
 import os
 import signal
@@ -27,10 +29,17 @@ def shell(script: str) -> subprocess.CompletedProcess[str]:
 @posix
 def test_devices_and_pipes_are_refused_at_once(capture, run):
     os.mkfifo("pipe")
-    for option, expected in (("--lights", "a file"), ("--mask", "a file"), ("--ground-truth", "a file")):
+    for option, expected in (
+        ("--lights", "a file"),
+        ("--mask", "a file"),
+        ("--ground-truth", "a file"),
+    ):
         for path, kind in (("/dev/zero", "a device"), ("pipe", "a pipe")):
             result = run("infer", capture, "--method", "ls", option, path)
-            assert (result.code, result.err) == (3, f"splinecli: {path}: found {kind}, expected {expected}.\n")
+            assert (result.code, result.err) == (
+                3,
+                f"splinecli: {path}: found {kind}, expected {expected}.\n",
+            )
     run("infer", capture, "--method", "ls")
     for command, code, expected in (
         ("integrate out/sphere --camera-matrix /dev/zero", 3, "a text file"),
@@ -38,16 +47,24 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
         ("integrate /dev/zero -o surface", 3, "a normal map"),
     ):
         result = run(*command.split())
-        assert (result.code, result.err) == (code, f"splinecli: /dev/zero: found a device, expected {expected}.\n")
+        assert (result.code, result.err) == (
+            code,
+            f"splinecli: /dev/zero: found a device, expected {expected}.\n",
+        )
 
 
 @posix
 @pytest.mark.parametrize(
-    "name", ["mask.png", "ambient.tif", "light_intensities.txt", "image9.png", "Normal_gt.npy", "rti.lp"]
+    "name",
+    ["mask.png", "ambient.tif", "light_intensities.txt", "image9.png", "Normal_gt.npy", "rti.lp"],
 )
 @pytest.mark.parametrize("kind", ["a pipe", "a broken link"])
 def test_what_is_no_file_is_not_passed_over(capture, run, name, kind):
-    for other in ("mask.png", "normals_gt.npy", *(["light_directions.txt"] if name == "rti.lp" else [])):
+    for other in (
+        "mask.png",
+        "normals_gt.npy",
+        *(["light_directions.txt"] if name == "rti.lp" else []),
+    ):
         (capture / other).unlink()
     if kind == "a pipe":
         os.mkfifo(capture / name)
@@ -73,9 +90,13 @@ def test_process_substitution_in_place_of_light_directions(capture, run):
 def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
     """The first megabyte is a whole light file."""
     command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"
-    result = shell(f"{command} <(cat {capture}/light_directions.txt; head -c 1000000 /dev/zero | tr '\\0' ' ')")
+    result = shell(
+        f"{command} <(cat {capture}/light_directions.txt; head -c 1000000 /dev/zero | tr '\\0' ' ')"
+    )
     assert result.returncode == 3
-    assert result.stderr.endswith("found more than 1.0 MB, expected a text file of at most 1.0 MB.\n")
+    assert result.stderr.endswith(
+        "found more than 1.0 MB, expected a text file of at most 1.0 MB.\n"
+    )
     assert not Path("out").exists()
 
 
@@ -92,7 +113,9 @@ def test_a_zero_byte_in_a_list_of_images(capture, run):
     (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
     result = run("infer", capture, "--method", "ls")
     assert result.code == 3
-    assert result.err.startswith('splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist')
+    assert result.err.startswith(
+        'splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist'
+    )
 
 
 def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path):
@@ -117,9 +140,12 @@ def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path
 def test_cells_are_no_formulas(make_capture, run):
     for name, cell in {"=1+1": "'=1+1", "\r=1": "\\r=1", " \n=1": " \\n=1"}.items():
         make_capture(name)
-        result = run("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite")
+        result = run(
+            "evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"
+        )
         assert result.code == 0
-        header, row = Path("evaluation/results.csv").read_bytes().decode().splitlines()  # also splits at \r
+        # also splits at \r
+        header, row = Path("evaluation/results.csv").read_bytes().decode().splitlines()
         assert dict(zip(header.split(","), row.split(","), strict=True))["capture"] == cell
 
 
@@ -127,17 +153,28 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
     elsewhere = make_capture("elsewhere")
     names = [f"../elsewhere/image{number}.png" for number in range(1, 9)]
     (capture / "filenames.txt").write_text("\n".join(names))
-    message = 'splinecli: sphere/filenames.txt:1: the image "../elsewhere/image1.png" is outside of this folder.'
-    for command in (["infer", "--method", "ls"], ["info"], ["evaluate", "--method", "ls", "--n-lights", 4]):
+    message = (
+        "splinecli: sphere/filenames.txt:1: the image"
+        ' "../elsewhere/image1.png" is outside of this folder.'
+    )
+    for command in (
+        ["infer", "--method", "ls"],
+        ["info"],
+        ["evaluate", "--method", "ls", "--n-lights", 4],
+    ):
         result = run(command[0], capture, *command[1:])
         assert result.code == 3 and message in result.err
         assert "set a link to it there" in result.err
-    (capture / "filenames.txt").write_text("\n".join(str((elsewhere / n).absolute()) for n in names))
+    (capture / "filenames.txt").write_text(
+        "\n".join(str((elsewhere / n).absolute()) for n in names)
+    )
     assert "is outside of this folder" in run("info", capture).err
     # It may name links to images elsewhere.
     for number in range(1, 9):
         (capture / f"photo{number}.png").symlink_to(elsewhere.absolute() / f"image{number}.png")
-    (capture / "filenames.txt").write_text("".join(f"photo{number}.png\n" for number in range(1, 9)))
+    (capture / "filenames.txt").write_text(
+        "".join(f"photo{number}.png\n" for number in range(1, 9))
+    )
     assert run("info", capture).code == 0
 
 
@@ -157,7 +194,10 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     decoded = chain([MemoryError()], repeat(DEFAULT))  # the first time only
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
     result = run("infer", capture, "second", "--method", "ls", "-q")
-    message = "splinecli: sphere: there is not enough memory. Close other programs, or use smaller images.\n"
+    message = (
+        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
+        " images.\n"
+    )
     assert (result.code, result.err) == (1, message)
     assert Path("out/second/normals.png").exists()
 
@@ -170,10 +210,13 @@ def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
 @posix
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_while_the_program_starts(capture, number):
-    """It comes when the first module of the command line is imported, before PyTorch and the rest."""
+    """It comes when the first module of the command line is imported,
+    before PyTorch and the rest.
+    """
     script = (
         "import os, signal, sys\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background"
+        " ignores it\n"
         "class Finder:\n"
         "    def find_spec(self, name, *_):\n"
         f"        if name == 'splinecli.cli.main': os.kill(os.getpid(), {int(number)})\n"
@@ -189,7 +232,9 @@ def test_a_signal_while_the_program_starts(capture, number):
 def start(code: str) -> subprocess.Popen[str]:
     """Start a process that runs the code as the command line would, and wait until it says so."""
     script = "import importlib, time\nm = importlib.import_module('splinecli.cli.main')"
-    script += f"\ndef work(*_):\n    {code}\nm.main = work\nfrom splinecli.__main__ import run\nrun()"
+    script += (
+        f"\ndef work(*_):\n    {code}\nm.main = work\nfrom splinecli.__main__ import run\nrun()"
+    )
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = subprocess.Popen([sys.executable, "-c", script], text=True, **pipes)
     assert process.stdout.readline() == "ready\n"
@@ -202,9 +247,11 @@ def start(code: str) -> subprocess.Popen[str]:
     [
         "print('ready', flush=True); time.sleep(60)",
         # An interruption that somebody swallows.
-        "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except BaseException: pass",
+        "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except"
+        " BaseException: pass",
         # A call into C that no signal interrupts.
-        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in range(60): a @ a",
+        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in"
+        " range(60): a @ a",
     ],
 )
 def test_sigterm_always_ends_a_process(code):
@@ -231,12 +278,19 @@ def test_the_dependencies_have_no_known_holes():
     """Floors above the versions with published holes in what is used here."""
     text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
     listed = tomllib.loads(text)["project"]["dependencies"]
-    floors = {name: tuple(map(int, floor.split("."))) for name, floor in (item.split(">=") for item in listed)}
+    floors = {
+        name: tuple(map(int, floor.split(".")))
+        for name, floor in (item.split(">=") for item in listed)
+    }
     for name, floor in {
         "torch": (2, 6),  # CVE-2025-32434: code runs from a file read with weights_only
         "pillow": (12, 3),  # writes beyond buffers, and bombs, in many formats
         "jinja2": (3, 1, 6),  # CVE-2025-27516
-        "opencv-python-headless": (4, 12),  # CVE-2025-53644: writes beyond a buffer in 4.10 and 4.11
+        # CVE-2025-53644: writes beyond a buffer in 4.10 and 4.11
+        "opencv-python-headless": (
+            4,
+            12,
+        ),
         "safetensors": (0, 5),
     }.items():
         assert floors[name] >= floor, name
@@ -270,8 +324,14 @@ __main__.run()
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path, name: str) -> None:
     (tmp_path / "library.py").write_text(LIBRARY.format(signal=name))
-    done = subprocess.run([sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "imported\n", "splinecli: interrupted.\n")
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (
+        130,
+        "imported\n",
+        "splinecli: interrupted.\n",
+    )
 
 
 def test_libraries_print_nothing(tmp_path: Path) -> None:
@@ -286,13 +346,17 @@ def noisy():
 sys.argv = ["splinecli", "noisy"]
 __main__.run()
 """
-    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", command], capture_output=True, text=True, timeout=60
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_an_interruption_is_told_once(capfd, monkeypatch):
     """The thread that ends the process after a SIGTERM may come when the command has told of it."""
-    monkeypatch.setattr(main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130}))
+    monkeypatch.setattr(
+        main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
+    )
     try:
         assert main.main([]) == report_interruption() == 130
     finally:

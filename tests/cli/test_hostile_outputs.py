@@ -1,4 +1,6 @@
-"""An output folder that somebody else prepared: nothing outside of it changes, nothing hangs, no traceback."""
+"""An output folder that somebody else prepared: nothing outside of it changes, nothing hangs, no
+traceback.
+"""
 
 import json
 import os
@@ -19,26 +21,43 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and 
 
 COMMANDS: dict[str, tuple[str, str, str]] = {
     "infer": (
-        "infer sphere --method ls --format npy,png8 -o out", "out/sphere",
+        "infer sphere --method ls --format npy,png8 -o out",
+        "out/sphere",
         "report.json normals.npy normals_8bit.png .lock",
     ),
-    "infer here": ("infer sphere --method ls --format npy -o .", "sphere", "report.json normals.npy mesh.glb"),
-    "integrate": ("integrate n.npy --format npy,ply -o out", "out", "surface.json depth.npy mesh.ply mesh.glb"),
+    "infer here": (
+        "infer sphere --method ls --format npy -o .",
+        "sphere",
+        "report.json normals.npy mesh.glb",
+    ),
+    "integrate": (
+        "integrate n.npy --format npy,ply -o out",
+        "out",
+        "surface.json depth.npy mesh.ply mesh.glb",
+    ),
     "evaluate": (
-        "evaluate sphere --method ls --n-lights 4 --trials 1 --figures -o out", "out",
+        "evaluate sphere --method ls --n-lights 4 --trials 1 --figures -o out",
+        "out",
         "results.json results.csv trials.jsonl lights.png figures/sphere.png figures",
     ),
-    "prepare": ("prepare sphere -o out", "out", "manifest.json contact_sheet.png sphere/mask.npy sphere"),
+    "prepare": (
+        "prepare sphere -o out",
+        "out",
+        "manifest.json contact_sheet.png sphere/mask.npy sphere",
+    ),
     "calibrate": (
-        "calibrate ball --circle 60,48,40 -o out", "out",
+        "calibrate ball --circle 60,48,40 -o out",
+        "out",
         "calibration.json light_directions.txt light_intensities.txt calibration.png",
     ),
-}  # fmt: skip
+}
 """A command, the folder that it writes, and names in it that somebody may have taken."""
 
 PLANTS: dict[str, Callable[[Path, Path], object]] = LINKS | {
     "folder": lambda path, _: path.mkdir(),
-    "wrong": lambda path, _: path.write_bytes(b'{"files": ["../../x", 5, "\\ud800"], "entries": 5}'),
+    "wrong": lambda path, _: path.write_bytes(
+        b'{"files": ["../../x", 5, "\\ud800"], "entries": 5}'
+    ),
 }
 
 
@@ -71,7 +90,9 @@ def everything_but(folder: Path) -> dict[str, tuple[object, ...]]:
     """What is beside a folder: kinds, contents and targets of links."""
     state: dict[str, tuple[object, ...]] = {}
     for path in Path().rglob("*"):
-        if not path.is_relative_to(folder) and not (folder.is_relative_to(path) or path.name == "index.html"):
+        if not path.is_relative_to(folder) and not (
+            folder.is_relative_to(path) or path.name == "index.html"
+        ):
             status = path.lstat()
             content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
             state[str(path)] = status.st_mode, status.st_ino, content
@@ -116,7 +137,10 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
 
 def test_trials_go_on_in_a_file_of_their_own(tmp_path):
     """Neither through a link nor through another name of the same file; whole lines stay."""
-    line = json.dumps({"key": "a", "mae_deg": 1.0, "seconds": 1.0, "estimated_intensities": False}) + "\n"
+    line = (
+        json.dumps({"key": "a", "mae_deg": 1.0, "seconds": 1.0, "estimated_intensities": False})
+        + "\n"
+    )
     elsewhere, path = tmp_path / "elsewhere", tmp_path / "trials.jsonl"
     elsewhere.write_text(line + line[:20])
     path.hardlink_to(elsewhere)

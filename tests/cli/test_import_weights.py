@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from networks.test_official import AuthorsLINet, AuthorsNENet
+from estimate.networks.test_official import AuthorsLINet, AuthorsNENet
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,15 @@ def test_imported_weights_run(run, document, make_capture):
     weights = ("--weights", "new/official.safetensors")
     report = document("infer", make_capture("sphere"), "--mask", "few.png", *weights)
     assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
-    quiet = run("import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors", "--overwrite", "-q")
+    quiet = run(
+        "import-weights",
+        "9-G.ckpt",
+        "9-D.ckpt",
+        "-o",
+        "new/official.safetensors",
+        "--overwrite",
+        "-q",
+    )
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 

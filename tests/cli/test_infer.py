@@ -1,4 +1,6 @@
-"""`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong."""
+"""`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes
+wrong.
+"""
 
 import json
 import os
@@ -18,7 +20,15 @@ from cli.conftest import EXAMPLE, read_report
 from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg, decode_picture
-from splinecli.records.output_files import ERROR_MAP, FOUND_MASK, LIGHT_PLOT, MAPS, NORMALS, PLOTS, SURFACE_FILES
+from splinecli.records.output_files import (
+    ERROR_MAP,
+    FOUND_MASK,
+    LIGHT_PLOT,
+    MAPS,
+    NORMALS,
+    PLOTS,
+    SURFACE_FILES,
+)
 
 
 def test_writes_the_contract(capture, truth, run, golden):
@@ -35,7 +45,8 @@ def test_writes_the_contract(capture, truth, run, golden):
 
     normals, mask = np.load(out / "normals.npy"), mask_of(capture) > 0
     assert normals.dtype == np.float32
-    # 16-bit images of up to 60000 counts: half a count is 5e-4 degrees, a handful of them at most 5e-3.
+    # 16-bit images of up to 60000 counts: half a count is 5e-4 degrees, a handful of them at most
+    # 5e-3.
     assert angle_between_deg(normals[mask], truth[mask]).max() < 5e-3
     assert not normals[~mask].any()
     np.testing.assert_array_equal(tifffile.imread(out / "normals.tiff"), normals)
@@ -67,8 +78,12 @@ def test_a_surface_in_millimetres(capture, run):
     assert (surface["unit"], surface["pixel_size_mm"]) == ("millimetre", 0.1)
     middle, rim = np.load("out/sphere/depth.npy")[11:13, 11:13].mean(), surface["range"][0]
     assert middle - rim == pytest.approx(0.1 * 12 / (2 * 2.5), rel=0.1)
-    # One of two rows and columns are read: each pixel of the map is as wide as two of the photographs.
-    assert run("infer", capture, "--method", "ls", "--scale", "1/2", *arguments, "--overwrite").code == 0
+    # One of two rows and columns are read: each pixel of the map is as wide as two of the
+    # photographs.
+    assert (
+        run("infer", capture, "--method", "ls", "--scale", "1/2", *arguments, "--overwrite").code
+        == 0
+    )
     scaled = read_report(Path("out/sphere"))["surface"]
     assert scaled["pixel_size_mm"] == 0.2
     assert np.ptp(scaled["range"]) == pytest.approx(np.ptp(surface["range"]), rel=0.2)
@@ -112,14 +127,23 @@ def test_a_mask_is_found_where_there_is_none(capture, run, document):
     (capture / "mask.png").unlink()
     report = document(*command)
     found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED)
-    assert ("found_mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
+    assert ("found_mask.png" in report["files"], report["n_pixels"]) == (
+        True,
+        np.count_nonzero(found),
+    )
     assert (found != mask).mean() < 0.02  # corners are rounded
-    both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite")
+    both = run(
+        "infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite"
+    )
     assert (both.code, "contradict each other. Leave one out" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
         cv2.imwrite(str(path), np.full(mask.shape, 30_000, np.uint16))
     nothing = run("infer", capture, "--method", "ls", "--auto-mask", "-o", "third")
-    assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (3, True, True)
+    assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (
+        3,
+        True,
+        True,
+    )
 
 
 def test_photographs_with_a_curve_and_ambient_light(capture, document):
@@ -142,17 +166,23 @@ def test_photographs_with_a_curve_and_ambient_light(capture, document):
 
 
 def test_a_mended_mask_stays(capture, document):
-    """A mask that was found, painted over, and given to the next call, which replaces the other results."""
+    """A mask that was found, painted over, and given to the next call, which replaces the other
+    results.
+    """
     Path("out/sphere").mkdir(parents=True)
     painted = np.zeros((24, 24), np.uint8)
     painted[5:15, 5:15] = 255
     cv2.imwrite("out/sphere/found_mask.png", painted)
     mended = ("--mask", "out/sphere/found_mask.png", "--overwrite")
     assert document("infer", capture, "--method", "ls", *mended)["n_pixels"] == 100
-    np.testing.assert_array_equal(cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted)
+    np.testing.assert_array_equal(
+        cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted
+    )
 
 
-@pytest.mark.parametrize("part", [("--crop", "1,2,22,21"), ("--crop", "1,1,22,22", "--scale", "1/3")])
+@pytest.mark.parametrize(
+    "part", [("--crop", "1,2,22,21"), ("--crop", "1,1,22,22", "--scale", "1/3")]
+)
 def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
     mask = darken_background(capture)
     (capture / "mask.png").unlink()
@@ -161,7 +191,9 @@ def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
     assert found.shape == mask.shape
     given = ("--mask", "out/sphere/found_mask.png", "-o", "again")
     assert run("infer", capture, "--method", "ls", *given, *part).code == 0
-    np.testing.assert_array_equal(np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy"))
+    np.testing.assert_array_equal(
+        np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy")
+    )
     # It is a mask of whole images, too, without gaps between the rows that were read.
     assert run("infer", capture, "--method", "ls", *given, "--overwrite").code == 0
     assert read_report(Path("again/sphere"))["n_pixels"] == np.count_nonzero(found)
@@ -206,9 +238,13 @@ def test_closed_streams_and_ascii_terminals(capture, make_capture):
     make_capture("naïve ☃")
 
     def call(name: str, redirection: str) -> int:
-        command = f'"{sys.executable}" -m splinecli infer "{name}" --method ls --overwrite {redirection}'
+        command = (
+            f'"{sys.executable}" -m splinecli infer "{name}" --method ls --overwrite {redirection}'
+        )
         environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-        return subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, env=environment).returncode
+        return subprocess.run(
+            ["sh", "-c", command], stderr=subprocess.PIPE, env=environment
+        ).returncode
 
     assert call("naïve ☃", "> seen.txt") == 0
     assert "na\\xefve" in Path("seen.txt").read_text()
@@ -219,7 +255,8 @@ def test_closed_streams_and_ascii_terminals(capture, make_capture):
 
 
 @pytest.mark.parametrize(
-    ("maps", "scales"), [("relief,curvature,gradient", (1, 0.05)), ("relief:0.5, curvature:0.1,gradient", (0.5, 0.1))]
+    ("maps", "scales"),
+    [("relief,curvature,gradient", (1, 0.05)), ("relief:0.5, curvature:0.1,gradient", (0.5, 0.1))],
 )
 def test_scales_of_pictures(capture, run, maps, scales):
     assert run("infer", capture, "--method", "ls", "--maps", maps, "--format", "npy,tiff").code == 0
@@ -235,7 +272,9 @@ def test_scales_of_pictures(capture, run, maps, scales):
         np.testing.assert_allclose(picture, expected, atol=0.51)
 
 
-@pytest.mark.parametrize("maps", ["albedo:2", "relief:", "relief:dark", "relief:0", "curvature:inf", "curvature:nan"])
+@pytest.mark.parametrize(
+    "maps", ["albedo:2", "relief:", "relief:dark", "relief:0", "curvature:inf", "curvature:nan"]
+)
 def test_scales_that_are_none(capture, run, maps):
     result = run("infer", capture, "--method", "ls", "--maps", maps)
     assert (result.code, result.out) == (2, "")
@@ -269,7 +308,9 @@ def test_no_result_beside_the_images_counts_as_one_of_them(run, document, captur
     for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, "confidence.png", FOUND_MASK):
         if not (capture / name).exists():
             cv2.imwrite(str(capture / name), np.zeros((24, 24), np.uint8))
-    pictures = {path.name for path in capture.glob("*") if path.suffix in IMAGE_SUFFIXES} - {"mask.png"}
+    pictures = {path.name for path in capture.glob("*") if path.suffix in IMAGE_SUFFIXES} - {
+        "mask.png"
+    }
     assert len(pictures) > 8 + 20
     assert document("info", capture)["images"] == 8
     assert document(*arguments, "--overwrite")["n_lights"] == first["n_lights"] == 8

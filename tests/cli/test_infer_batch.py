@@ -34,7 +34,9 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
     assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
 
-    documents = json.loads(run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out)
+    documents = json.loads(
+        run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out
+    )
     assert documents[0] == read_report(Path("out/sphere"))
     assert documents[1]["capture"] == "broken"
     assert "image3.png" in documents[1]["error"]
@@ -54,7 +56,11 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     write_object(holder, "specular", "metallic")
     result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
     assert result.code == 0 and result.err.endswith("2 captures: 2 done; see out/index.html\n")
-    assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
+    assert {path.name for path in Path("out").iterdir()} == {
+        "index.html",
+        "Ball_specular",
+        "Ball_metallic",
+    }
     assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.
     result = run("infer", holder, capture, "--method", "ls", "--overwrite")
@@ -78,7 +84,9 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
     assert all((Path("out") / unquote(link)).is_file() for link in links)
     assert "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC" in index
-    pages = re.findall(r'<img src="data:image/jpeg;base64,[^"]+" alt="Normal map of ([^"]+)"', index)
+    pages = re.findall(
+        r'<img src="data:image/jpeg;base64,[^"]+" alt="Normal map of ([^"]+)"', index
+    )
     assert pages == ["sphere", "a b"]
     assert run("infer", *captures).code == 3  # our own index is replaced
     # Later results in the same place join it, and those of a single capture, too.
@@ -98,7 +106,16 @@ def test_names_that_are_no_text(capture, make_capture, run):
 
 
 def test_a_folder_that_is_given_twice_counts_once(capture, run):
-    result = run("infer", capture, capture.absolute(), "others/../sphere", "sphere/", "--method", "ls", "--json")
+    result = run(
+        "infer",
+        capture,
+        capture.absolute(),
+        "others/../sphere",
+        "sphere/",
+        "--method",
+        "ls",
+        "--json",
+    )
     (document,) = json.loads(result.out)
     assert (result.code, result.err, document["capture"]) == (0, "", "sphere")
     assert not Path("out/index.html").exists()
@@ -107,12 +124,20 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("--maps", "albedo", "confidence"), 2, "confidence: the folder does not exist. Write lists with commas"),
+        (
+            ("--maps", "albedo", "confidence"),
+            2,
+            "confidence: the folder does not exist. Write lists with commas",
+        ),
         (("--lights", "none.txt"), 3, "none.txt: the file does not exist."),
         (("--mask", "none.png"), 3, "none.png: the file does not exist."),
         (("--flat-field", "none"), 3, "none: the folder does not exist."),
         (("--maps", "albedo,depth"), 2, "--maps has 'depth'"),
-        (("--transfer", "rec709"), 2, "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"),
+        (
+            ("--transfer", "rec709"),
+            2,
+            "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10",
+        ),
         (("--white-level", "0"), 2, "--white-level is '0'; expected a number above 0"),
         (("--weights", "spline-net"), 2, "method ls uses no weights"),
         (("--maps", "confidence"), 2, "method ls does not provide confidence"),
@@ -124,7 +149,9 @@ def test_arguments_are_checked_before_the_first_capture(
 ):
     make_capture("second")
     touched = []
-    monkeypatch.setattr("splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1))
+    monkeypatch.setattr(
+        "splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1)
+    )
     call = ("infer", capture, "second", "--method", "ls", *arguments)
     result = run(*call)
     assert (result.code, result.out, touched) == (code, "", [])
@@ -136,18 +163,36 @@ def test_arguments_are_checked_before_the_first_capture(
 
 
 def test_options_are_written_and_read_back(capture, run):
-    """They are the report's `options`, go through JSON and pickle, and tell what changes the results."""
+    """They are the report's `options`, go through JSON and pickle, and tell what changes the
+    results.
+    """
     options = InferOptions(
-        method="ls", n_lights=5, seed=3, formats=("npy",), maps=("albedo",), white_level=60_000.5, output="elsewhere"
+        method="ls",
+        n_lights=5,
+        seed=3,
+        formats=("npy",),
+        maps=("albedo",),
+        white_level=60_000.5,
+        output="elsewhere",
     )
     assert InferOptions.from_dict(json.loads(json.dumps(options.as_dict()))) == options
     assert pickle.loads(pickle.dumps(options)) == options
     assert infer_capture(capture, options)["options"] == options.as_dict()
     assert read_report(Path("elsewhere/sphere"))["options"] == options.as_dict()
-    assert options.changes(InferOptions.from_dict({**options.as_dict(), "output": "x", "device": "cpu"})) == []
+    assert (
+        options.changes(
+            InferOptions.from_dict({**options.as_dict(), "output": "x", "device": "cpu"})
+        )
+        == []
+    )
     assert options.changes(InferOptions.from_dict({**options.as_dict(), "seed": 4})) == ["--seed"]
     contradictions = {"mask": "m.png", "auto_mask": True}, {"align": True, "scale": "1/2"}
-    for wrong in ({"formats": ("bmp",)}, {"maps": ("depth",)}, {"convention": "up"}, *contradictions):
+    for wrong in (
+        {"formats": ("bmp",)},
+        {"maps": ("depth",)},
+        {"convention": "up"},
+        *contradictions,
+    ):
         with pytest.raises(UsageError):
             InferOptions(**wrong)
 
@@ -167,11 +212,20 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
 
     recorder = Recorder()
     outcomes = list(infer_batch([capture, Path("second")], InferOptions(method="ls"), recorder))
-    assert [(one.report["capture"], one.status) for one in outcomes] == [("sphere", "done"), ("second", "done")]
+    assert [(one.report["capture"], one.status) for one in outcomes] == [
+        ("sphere", "done"),
+        ("second", "done"),
+    ]
     assert list(recorder.bars) == ["sphere", "second"]
     for steps in recorder.bars.values():
         amounts, notes = zip(*steps, strict=True)
-        assert list(dict.fromkeys(notes)) == ["reading", "checking", "estimating", "maps", "writing"]
+        assert list(dict.fromkeys(notes)) == [
+            "reading",
+            "checking",
+            "estimating",
+            "maps",
+            "writing",
+        ]
         assert min(amounts) >= 0 and 0.5 < sum(amounts) <= 1 + 1e-9
 
 
@@ -194,7 +248,9 @@ def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, st
 
     options, statuses = InferOptions(method="ls"), []
     for observer in (Meddler(), Observer(), Observer()):
-        statuses += [outcome.status for outcome in infer_batch([capture], options, observer, redo="changed")]
+        statuses += [
+            outcome.status for outcome in infer_batch([capture], options, observer, redo="changed")
+        ]
     assert statuses == ["done", "done", "skipped"]
 
 
@@ -208,7 +264,9 @@ def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
         parts = [Path(place, name, "normals.npy").read_bytes() for place in ("out", "whole")]
         assert parts[0] == parts[1]
     links = re.findall(r'href="([^"]+normals.npy)"', Path("out/index.html").read_text("utf-8"))
-    assert sorted(unquote(link) for link in links) == sorted(f"{name}/normals.npy" for name in names)
+    assert sorted(unquote(link) for link in links) == sorted(
+        f"{name}/normals.npy" for name in names
+    )
 
 
 def test_json_lines(capture, make_capture, run):
@@ -218,19 +276,28 @@ def test_json_lines(capture, make_capture, run):
     call = ("infer", "sphere", "broken", "second", "--method", "ls")
     lines = run(*call, "--jsonl").out.splitlines()
     assert lines == [json.dumps(document) for document in json.loads(run(*call, "--json").out)]
-    for arguments in (("--jsonl", "--json"), ("--jsonl", "--method", "magic"), ("--jsonl", "--strange")):
+    for arguments in (
+        ("--jsonl", "--json"),
+        ("--jsonl", "--method", "magic"),
+        ("--jsonl", "--strange"),
+    ):
         result = run(*call, *arguments)
         document = json.loads(result.out)
         assert (result.code, document["capture"], document["exit_code"]) == (2, None, 2)
 
 
-@pytest.mark.parametrize(("codes", "worst"), [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)])
+@pytest.mark.parametrize(
+    ("codes", "worst"), [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)]
+)
 def test_the_worst_exit_code(codes, worst):
     assert worst_exit_code(codes) == worst
 
 
 FAILURES = {
-    "unreadable image": (PermissionError(errno.EACCES, "Permission denied", "sphere/image1.png"), 3),
+    "unreadable image": (
+        PermissionError(errno.EACCES, "Permission denied", "sphere/image1.png"),
+        3,
+    ),
     "bad input": (InputError("the image is damaged"), 3),
     "usage": (UsageError("too few lights"), 2),
     "defect": (RuntimeError("oops"), 1),
@@ -238,7 +305,9 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize("place", [(InferOptions, "open"), (LeastSquares, "estimate")], ids=["open", "estimate"])
+@pytest.mark.parametrize(
+    "place", [(InferOptions, "open"), (LeastSquares, "estimate")], ids=["open", "estimate"]
+)
 def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch):
     """The others go on, whatever is raised and wherever."""
     names = [str(make_capture(name)) for name in (*FAILURES, "good")]
@@ -259,7 +328,9 @@ def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch)
     assert failed[0]["error"] == "sphere/image1.png: cannot be read (Permission denied)."
     assert all(f"splinecli: {one['error']}\n" in result.err for one in failed)
     assert result.err.count("Traceback") == 1
-    assert "defect: RuntimeError: oops. This is a defect of splinecli. Please report it" in result.err
+    assert (
+        "defect: RuntimeError: oops. This is a defect of splinecli. Please report it" in result.err
+    )
 
 
 def test_files_without_permission(make_capture, run_without_privileges):
@@ -293,20 +364,28 @@ def test_what_is_no_folder_is_the_failure_of_its_capture(capture, run):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_folders_that_cannot_be_written_do_not_end_a_batch(make_capture, run_without_privileges, workers):
+def test_folders_that_cannot_be_written_do_not_end_a_batch(
+    make_capture, run_without_privileges, workers
+):
     names = ["closed", "file", "good"]
     for name in names:
         make_capture(name)
     Path("out/closed").mkdir(parents=True, mode=0o555)
     Path("out/file").write_text("mine")
-    result = run_without_privileges("infer", *names, "--method", "ls", "--jsonl", "--workers", workers)
+    result = run_without_privileges(
+        "infer", *names, "--method", "ls", "--jsonl", "--workers", workers
+    )
     found = {document["capture"]: document for document in map(json.loads, result.out.splitlines())}
     assert (result.code, found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5, 5)
-    assert found["closed"]["error"].startswith("out/closed: no permission to write into this folder")
+    assert found["closed"]["error"].startswith(
+        "out/closed: no permission to write into this folder"
+    )
     assert found["good"] == read_report(Path("out/good"))
 
 
-@pytest.mark.parametrize("error", [NoRoomError("full"), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize(
+    "error", [NoRoomError("full"), OSError(errno.ENOSPC, "No space left on device")]
+)
 def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch):
     monkeypatch.setattr("splinecli.results.files.write_estimate", Mock(side_effect=error))
     result = run("infer", capture, make_capture("second"), "--method", "ls", "--json")
@@ -323,7 +402,9 @@ def test_images_in_place_of_their_folder(run, capture):
 
 @pytest.mark.parametrize(("count", "captures"), [(1, 5), (3, 0), (7, 23), (40, 23)])
 def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
-    """Each shard sees the folders in an order of its own, as shells of different languages give it."""
+    """Each shard sees the folders in an order of its own, as shells of different languages give
+    it.
+    """
     names = [f"{'aBéz'[index % 4]}{index}" for index in range(captures)]
     for name in names:
         (tmp_path / name).mkdir()
@@ -336,7 +417,9 @@ def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
-@pytest.mark.parametrize("text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"])
+@pytest.mark.parametrize(
+    "text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"]
+)
 def test_other_shards_are_refused(text):
     with pytest.raises(UsageError, match="--shard is"):
         Shard.parse(text)

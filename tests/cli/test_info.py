@@ -45,11 +45,16 @@ def test_few_lights_near_the_axis(run, document, truth):
         "All lights are within 25 degrees of the camera axis; lower lights give better normals.",
     ]
     assert document("info", "near")["warnings"] == warnings
-    assert [line.partition("near: ")[2] for line in run("infer", "near", "--method", "ls").err.splitlines()] == warnings
+    assert [
+        line.partition("near: ")[2]
+        for line in run("infer", "near", "--method", "ls").err.splitlines()
+    ] == warnings
 
 
 def test_the_camera_of_exif(run, document):
-    """A lens of 50 mm on film of 43.3 mm across the diagonal, before 36 x 24 mm in 360 x 240 pixels."""
+    """A lens of 50 mm on film of 43.3 mm across the diagonal, before 36 x 24 mm in 360 x 240
+    pixels.
+    """
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 50
     Path("photographs").mkdir()
@@ -59,7 +64,10 @@ def test_the_camera_of_exif(run, document):
     report = document("info", "photographs")
     assert report["camera_matrix"] is None
     assert report["exif_camera_matrix"] == [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]]
-    words = "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500 119.5, 0 0 1"
+    words = (
+        "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500"
+        " 119.5, 0 0 1"
+    )
     assert f"camera       {words}" in run("info", "photographs").out
 
 
@@ -81,7 +89,10 @@ def test_warnings(run, capture):
     assert all(word in warning for word, warning in zip(words, warnings[:3], strict=True))
     cv2.imwrite(str(photographs[3]), stored[:20])
     result = run("info", str(capture), "--json")
-    assert (result.code, "image4.png: found an image of 24 x 20 pixels, expected 24 x 24" in result.err) == (3, True)
+    assert (
+        result.code,
+        "image4.png: found an image of 24 x 20 pixels, expected 24 x 24" in result.err,
+    ) == (3, True)
 
 
 def test_the_plot_replaces_no_photograph(run, capture):
@@ -102,8 +113,13 @@ def test_the_white_level_of_12_bit_data(run, document, capture):
     assert "white level  4095, found in the images\n" in run("info", capture).out
     report = document("info", capture)
     mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
-    shares = [(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean() for path in capture.glob("image*.png")]
-    assert max(shares) > 0.1 and report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
+    shares = [
+        (cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean()
+        for path in capture.glob("image*.png")
+    ]
+    assert max(shares) > 0.1 and report["exposure"]["saturated"] == pytest.approx(
+        max(shares), abs=1e-4
+    )
     assert report["exposure"]["bright"][1] == pytest.approx(1)
 
 

@@ -52,13 +52,25 @@ def test_heights_and_mesh_of_a_sphere(run):
     np.testing.assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
     report = json.loads(Path("out/surface.json").read_text())
     assert report["n_pixels"] == inside.sum()
-    assert report["files"] == ["mesh.ply", "mesh.obj", "mesh.mtl", "depth.npy", "depth.tiff", "surface.json"]
+    assert report["files"] == [
+        "mesh.ply",
+        "mesh.obj",
+        "mesh.mtl",
+        "depth.npy",
+        "depth.tiff",
+        "surface.json",
+    ]
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(report["files"])
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
 def test_a_picture_of_the_other_convention(run):
-    assert run("integrate", "directx.png", "--convention", "directx", "-o", "out", "--format", "npy").code == 0
+    assert (
+        run(
+            "integrate", "directx.png", "--convention", "directx", "-o", "out", "--format", "npy"
+        ).code
+        == 0
+    )
     check_heights(np.load("out/depth.npy"))
 
 
@@ -68,7 +80,16 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
     """The values of .npy and .tiff have y up, whatever the green of the pictures means."""
     depths = []
     for convention, more in (("opengl", []), ("directx", given)):
-        arguments = ["--method", "ls", "--format", form, "--convention", convention, "-o", convention]
+        arguments = [
+            "--method",
+            "ls",
+            "--format",
+            form,
+            "--convention",
+            convention,
+            "-o",
+            convention,
+        ]
         assert run("infer", capture, *arguments).code == 0
         result = run("integrate", f"{convention}/sphere", "--format", "npy", "-q", *more)
         assert (result.code, result.out, result.err) == (0, "", "")
@@ -86,7 +107,9 @@ def test_an_array_of_something_else(run):
 @pytest.mark.parametrize("where", ["mask", "alpha"])
 def test_a_background_that_is_not_black(run, where):
     normals, _, inside = sphere()
-    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(np.uint16)[..., ::-1]
+    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(
+        np.uint16
+    )[..., ::-1]
     cut = inside.astype(np.uint16) * 65_535
     cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
     cv2.imwrite("mask.png", cut)
@@ -105,7 +128,10 @@ def write_depth(form: str, depth: np.ndarray) -> str:
     elif form == "tif":
         tifffile.imwrite("prior.tif", depth)
     else:
-        header = {"compression": (exr := pytest.importorskip("OpenEXR")).ZIP_COMPRESSION, "type": exr.scanlineimage}
+        header = {
+            "compression": (exr := pytest.importorskip("OpenEXR")).ZIP_COMPRESSION,
+            "type": exr.scanlineimage,
+        }
         exr.File(header, {"Z": depth}).write("prior.exr")
     return f"prior.{form}"
 
@@ -115,10 +141,23 @@ def test_a_prior(run, form):
     """Its heights in millimetres decide where the surface is."""
     _, heights, inside = sphere()
     prior = write_depth(form, np.where(inside, 0.5 * (heights + 100), np.nan).astype(np.float32))
-    arguments = ["normals.png", "--prior", prior, "--pixel-size", "0.5", "-o", "out", "--format", "npy", "--json"]
+    arguments = [
+        "normals.png",
+        "--prior",
+        prior,
+        "--pixel-size",
+        "0.5",
+        "-o",
+        "out",
+        "--format",
+        "npy",
+        "--json",
+    ]
     report = json.loads(run("integrate", *arguments).out)
     assert (report["prior"], report["unit"]) == (prior, "millimetre")
-    np.testing.assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
+    np.testing.assert_allclose(
+        np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2
+    )
 
 
 def with_one(value: float, every: int = 1) -> np.ndarray:
@@ -134,9 +173,18 @@ BAD_PRIORS = {
     "vectors": (np.ones((*SHAPE, 2), np.float32), "expected floating-point numbers"),
     "nothing": (np.full(SHAPE, np.nan, np.float32), "the prior has no value in the mask"),
     "larger than squares": (sphere()[1] * 1e200, "values of the prior are beyond 1e+07"),
-    "one of 1e60": (with_one(1e60), "values of the prior are beyond 1e+07, the first in row 9, column 20."),
-    "one of 1e6": (with_one(1e6), "than 3 times the width of the object, the first in row 9, column 20."),
-    "one among few": (with_one(1e6, 97), "than 3 times the width of the object, the first in row 9, column 20."),
+    "one of 1e60": (
+        with_one(1e60),
+        "values of the prior are beyond 1e+07, the first in row 9, column 20.",
+    ),
+    "one of 1e6": (
+        with_one(1e6),
+        "than 3 times the width of the object, the first in row 9, column 20.",
+    ),
+    "one among few": (
+        with_one(1e6, 97),
+        "than 3 times the width of the object, the first in row 9, column 20.",
+    ),
     "negated": (-sphere()[1].astype(np.float32), "the prior is -"),
 }
 
@@ -146,7 +194,11 @@ def test_a_bad_prior(run, case):
     prior, message = BAD_PRIORS[case]
     np.save("prior.npy", prior)
     result = run("integrate", "normals.png", "--prior", "prior.npy", "-o", "out")
-    assert (result.code, message in result.err, Path("out/surface.json").exists()) == (3, True, False), result.err
+    assert (result.code, message in result.err, Path("out/surface.json").exists()) == (
+        3,
+        True,
+        False,
+    ), result.err
 
 
 @pytest.mark.parametrize("form", ["npy", "tif", "exr"])
@@ -157,7 +209,12 @@ def test_a_damaged_prior(run, form):
     for content in (b"\x93NUMPY\x01\x00garbage", whole[: len(whole) // 2]):
         prior.write_bytes(content)
         result = run("integrate", "normals.png", "--prior", prior, "-o", "out")
-        assert (result.code, result.out, result.err.count("\n"), prior.name in result.err) == (3, "", 1, True), result
+        assert (result.code, result.out, result.err.count("\n"), prior.name in result.err) == (
+            3,
+            "",
+            1,
+            True,
+        ), result
     assert run("integrate", "normals.png", "--prior-detail", "9", "-o", "out").code == 2
 
 
@@ -184,7 +241,9 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     [report] = json.loads(run("infer", folder, *VIEWS[view].split(), *arguments).out)
     Path("camera.txt").unlink()
     places = (Path("out") / folder, Path("again"))
-    again = json.loads(run("integrate", places[0], "-o", "again", "--format", "ply,glb,npy", "--json").out)
+    again = json.loads(
+        run("integrate", places[0], "-o", "again", "--format", "ply,glb,npy", "--json").out
+    )
     assert {name: again[name] for name in report["surface"]} == report["surface"]
     # Normals that are read are scaled to unit length again, which may change their last bit.
     depths = [np.load(place / "depth.npy") for place in places]
@@ -199,7 +258,9 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
 def test_the_unit_of_lamps_is_not_that_of_the_surface(document, size):
     """Lamps in a unit in which pixels are smaller than any in millimetres."""
     np.savetxt("lamps.txt", 1e-9 * BUMP_LAMPS)
-    document("infer", write_bump(Path("bump")), "--method", "ls", *size, "--light-positions", "lamps.txt")
+    document(
+        "infer", write_bump(Path("bump")), "--method", "ls", *size, "--light-positions", "lamps.txt"
+    )
     report = document("integrate", "out/bump", "--format", "npy")
     assert (report["unit"], report["pixel_size_mm"]) == ("pixel", None)
 
@@ -220,7 +281,9 @@ def test_a_part_in_colour_by_perspective(run):
     assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
     # A pixel without a size counts as a millimetre. Columns 7 to 24 are on the object.
     assert trimesh.load("out/mesh.glb").extents[0] == pytest.approx(0.017, rel=0.05)
-    sized = json.loads(run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out)
+    sized = json.loads(
+        run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out
+    )
     assert (sized["unit"], sized["pixel_size_mm"]) == ("millimetre", 2)
     assert sized["range"] == pytest.approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
 
@@ -233,7 +296,9 @@ def test_millimetres_in_the_files(run):
     _, heights, inside = sphere()
     columns = np.flatnonzero(inside.any(axis=0))
     width_mm, depth = 0.5 * float(np.ptp(columns)), np.load("out/depth.npy")
-    assert np.nanmax(depth) - np.nanmin(depth) == pytest.approx(0.5 * np.ptp(heights[inside]), rel=0.02)
+    assert np.nanmax(depth) - np.nanmin(depth) == pytest.approx(
+        0.5 * np.ptp(heights[inside]), rel=0.02
+    )
     assert report["range"] == pytest.approx([np.nanmin(depth), np.nanmax(depth)], rel=1e-6)
     for name, unit_mm in (("mesh.ply", 1), ("mesh.stl", 1), ("mesh.glb", 1000)):
         extents = trimesh.load(Path("out", name)).extents * unit_mm
@@ -257,13 +322,18 @@ def test_a_picture_of_the_depth(run):
 
 
 def test_the_angle_of_a_levelled_surface_is_printed(run):
-    np.save("tilted.npy", np.full((20, 30, 3), (0.0, np.sin(np.radians(5)), np.cos(np.radians(5))), np.float32))
+    np.save(
+        "tilted.npy",
+        np.full((20, 30, 3), (0.0, np.sin(np.radians(5)), np.cos(np.radians(5))), np.float32),
+    )
     result = run("integrate", "tilted.npy", "-o", "out", "--level", "plane")
     assert (result.code, result.err) == (0, "The surface was levelled by 5.00 degrees\n")
 
 
 def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
-    """A mesh without triangles, and one that takes more memory than there is, have one message before the work."""
+    """A mesh without triangles, and one that takes more memory than there is, have one message
+    before the work.
+    """
     mask = np.zeros((24, 24), np.uint8)
     mask[8:16, 12] = 255  # a line
     cv2.imwrite("line.png", mask)
@@ -287,18 +357,34 @@ def test_a_damaged_report_is_named(run, capture):
     path = Path("out", capture, "report.json")
     whole = json.loads(path.read_text())
     for where, key, value in (
-        ("options", "crop", 5), ("options", "scale", 3), ("options", "pixel_size", [1]),
-        ("options", "convention", None), ("options", "discontinuity", -1), ("", "options", 7), ("", "options", {}),
-        ("", "files", ["normals.npy", 5]), ("", "file_sizes", 7), ("", "camera_matrix", [[0, 0, 0]] * 3),
-        ("", "camera_matrix", 1), ("", "near_lamps", 1),
+        ("options", "crop", 5),
+        ("options", "scale", 3),
+        ("options", "pixel_size", [1]),
+        ("options", "convention", None),
+        ("options", "discontinuity", -1),
+        ("", "options", 7),
+        ("", "options", {}),
+        ("", "files", ["normals.npy", 5]),
+        ("", "file_sizes", 7),
+        ("", "camera_matrix", [[0, 0, 0]] * 3),
+        ("", "camera_matrix", 1),
+        ("", "near_lamps", 1),
         ("", "near_lamps", {"camera": "perspective", "camera_matrix": [[0, 0, 0]] * 3}),
-    ):  # fmt: skip
+    ):
         report = deepcopy(whole)
         (report[where] if where else report)[key] = value
         path.write_text(json.dumps(report))
         result = run("integrate", path.parent, "-o", "again")
-        problem = " is damaged" if key in ("files", "file_sizes") else ": is damaged, or from another version"
-        assert (result.code, result.err.count("\n"), f"report.json{problem}" in result.err) == (3, 1, True), (
+        problem = (
+            " is damaged"
+            if key in ("files", "file_sizes")
+            else ": is damaged, or from another version"
+        )
+        assert (result.code, result.err.count("\n"), f"report.json{problem}" in result.err) == (
+            3,
+            1,
+            True,
+        ), (
             key,
             value,
         )

@@ -1,4 +1,6 @@
-"""Near lamps on the command line: the same capture, told in each way in which a user may tell where the lamps are."""
+"""Near lamps on the command line: the same capture, told in each way in which a user may tell where
+the lamps are.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -48,8 +50,13 @@ def test_files_and_options_mean_the_same(run, infer, mean_error, near: Path) -> 
     assert report["angular_error_deg"]["mean"] < 0.1
     assert [warning["code"] for warning in report["warnings"]] == ["few_lights"]
     assert report["near_lamps"]["pixel_size"] == 2
-    assert report["near_lamps"]["distances"] == pytest.approx(np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3)
-    assert "lamps        near, as in bump/light_positions.txt; a pixel is 2 wide" in run("info", "bump").out
+    assert report["near_lamps"]["distances"] == pytest.approx(
+        np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3
+    )
+    assert (
+        "lamps        near, as in bump/light_positions.txt; a pixel is 2 wide"
+        in run("info", "bump").out
+    )
     # A changed position is a change of the capture.
     moved = BUMP_LAMPS.copy()
     moved[0] += 5
@@ -106,16 +113,40 @@ def test_refused_options(run, bump: Path, arguments: str, code: int, message: st
 def test_wrong_files_are_named(run, near: Path) -> None:
     for name, text, message in (
         ("pixel_size.txt", "1 2\n", 'pixel_size.txt:1: found "1 2", expected one number above 0'),
-        ("pixel_size.txt", "# width\n0.9 mm\n", 'pixel_size.txt:2: found "0.9 mm", expected one number'),
-        ("camera_matrix.txt", "1 2\n3 4\n", "camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3"),
+        (
+            "pixel_size.txt",
+            "# width\n0.9 mm\n",
+            'pixel_size.txt:2: found "0.9 mm", expected one number',
+        ),
+        (
+            "camera_matrix.txt",
+            "1 2\n3 4\n",
+            "camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3",
+        ),
         ("camera_matrix.txt", "-1 0 0\n0 1 0\n0 0 1\n", "not a"),
-        ("light_positions.txt", "1 2 -3\n" * 7, "light_positions.txt:1: found a lamp behind the object"),
+        (
+            "light_positions.txt",
+            "1 2 -3\n" * 7,
+            "light_positions.txt:1: found a lamp behind the object",
+        ),
         ("light_positions.txt", "0 0 0\n" * 7, "found a zero vector, expected a lamp position"),
         ("light_positions.txt", "1 2 3\n" * 5, "found 5 lamp positions, expected 7"),
         ("light_lobes.txt", "0 0 -1 2\n" * 3, "light_lobes.txt: found 3 lines, expected 1 or 7"),
-        ("light_lobes.txt", "# LEDs\n0 0 -1\n", 'light_lobes.txt:2: found "0 0 -1", expected x y z mu'),
-        ("light_lobes.txt", "0 0 -1 -2\n", 'light_lobes.txt:1: found "0 0 -1 -2", expected x y z mu'),
-        ("light_lobes.txt", "0 0 -1 2\n" * 6 + "0 0 1 2\n", "light_lobes.txt:7: lamp 7 shines away from the object"),
+        (
+            "light_lobes.txt",
+            "# LEDs\n0 0 -1\n",
+            'light_lobes.txt:2: found "0 0 -1", expected x y z mu',
+        ),
+        (
+            "light_lobes.txt",
+            "0 0 -1 -2\n",
+            'light_lobes.txt:1: found "0 0 -1 -2", expected x y z mu',
+        ),
+        (
+            "light_lobes.txt",
+            "0 0 -1 2\n" * 6 + "0 0 1 2\n",
+            "light_lobes.txt:7: lamp 7 shines away from the object",
+        ),
     ):
         (near / "pixel_size.txt").write_text("2\n")
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
@@ -126,7 +157,9 @@ def test_wrong_files_are_named(run, near: Path) -> None:
 
 
 def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bump: Path) -> None:
-    """The camera is in the report, and comes from the option or the folder. A changed matrix changes the capture."""
+    """The camera is in the report, and comes from the option or the folder. A changed matrix
+    changes the capture.
+    """
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     orthographic = infer()
     assert orthographic["camera_matrix"] is None
@@ -156,7 +189,9 @@ def test_a_file_of_lobes(run, infer, mean_error, near: Path) -> None:
     even = infer()
     check(even, "Report")
     assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
-    assert even["angular_error_deg"]["mean"] == pytest.approx(without["angular_error_deg"]["mean"], abs=1e-3)
+    assert even["angular_error_deg"]["mean"] == pytest.approx(
+        without["angular_error_deg"]["mean"], abs=1e-3
+    )
     (near / "light_lobes.txt").write_text("0 0.2 -1 5\n")
     narrow = infer()
     assert narrow["angular_error_deg"]["mean"] > without["angular_error_deg"]["mean"] + 0.1
@@ -167,16 +202,28 @@ def test_a_file_of_lobes(run, infer, mean_error, near: Path) -> None:
 
 @pytest.mark.parametrize("command", ["infer", "info"])
 def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command: str) -> None:
-    """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the bump."""
-    arguments = [command, "bump", *(["--method", "ls", "--overwrite"] if command == "infer" else [])]
+    """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the
+    bump.
+    """
+    arguments = [
+        command,
+        "bump",
+        *(["--method", "ls", "--overwrite"] if command == "infer" else []),
+    ]
     distances = np.linalg.norm(BUMP_LAMPS, axis=1) / 1000
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS / 1000)
     refused = run(*arguments, "--strict")
     assert refused.code == 3
-    lamp = f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object, which is 64"
+    lamp = (
+        f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object,"
+        " which is 64"
+    )
     assert lamp in refused.err
     assert "inside the object. Give all lengths in one unit, such as millimetres" in refused.err
-    for factor, words in ((0.3, "A lamp is very near"), (1000, "so far away that their light is parallel")):
+    for factor, words in (
+        (0.3, "A lamp is very near"),
+        (1000, "so far away that their light is parallel"),
+    ):
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
         for strict, code in ((("--strict",), 3), ((), 0)):
             warned = run(*arguments, *strict)
@@ -189,7 +236,9 @@ def test_evaluate_and_prepare(run, document, near: Path) -> None:
     """Scoring a sample of the pixels finds the surface from all of them."""
 
     def error(words: str) -> float:
-        return document("evaluate", "bump", "--method", "ls", "--trials", 1, *words.split())["results"][0]["mae_deg"]
+        return document("evaluate", "bump", "--method", "ls", "--trials", 1, *words.split())[
+            "results"
+        ][0]["mae_deg"]
 
     assert max(error("--n-lights 5"), error("--n-lights 5 --max-pixels 50")) < 0.2
     assert error("--n-lights all --light-noise-deg 4") > 0.5
@@ -198,7 +247,9 @@ def test_evaluate_and_prepare(run, document, near: Path) -> None:
 
 
 def test_albedo_and_saturation(infer, near: Path) -> None:
-    """The bump has one albedo, and pixels that are clipped at 70 % of the brightest are restored."""
+    """The bump has one albedo, and pixels that are clipped at 70 % of the brightest are
+    restored.
+    """
     for path in near.glob("*.png"):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.minimum(image, 26_000))

@@ -14,7 +14,9 @@ from kills import content
 
 @pytest.fixture
 def cycles_images() -> dict[str, np.ndarray]:
-    """The images (F, H, W, 3) by kind of one object in the published layout, below the folder `cycles`."""
+    """The images (F, H, W, 3) by kind of one object in the published layout, below the folder
+    `cycles`.
+    """
     shiny = write_object(Path("cycles/PRPS/Turtle"), "specular", "metallic", n_lights=4)
     return shiny | write_object(Path("cycles/PRPS_Diffuse/Turtle"), "diffuse", seed=1, n_lights=4)
 
@@ -26,7 +28,10 @@ def arrays(entry: str) -> dict[str, np.ndarray]:
 def test_a_capture(run, capture, truth):
     result = run("prepare", capture, "-o", "set")
     assert result.code == 0
-    assert result.out == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
+    assert (
+        result.out
+        == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
+    )
     assert result.err == "sphere: 448 pixels, 8 lights, sphere\n"
     found = arrays("sphere")
     mask = found["mask"]
@@ -41,9 +46,14 @@ def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
     assert (summary["entries"], summary["scenes"]) == (3, 1)
     whole, half = arrays("Turtle_diffuse"), arrays("Turtle_specular")
     # The masks are a box of 5 x 7 pixels.
-    expected = {kind: images.mean(axis=3)[:, 1:6, 2:9] / 65535 for kind, images in cycles_images.items()}
-    np.testing.assert_allclose(whole["observations"], expected["diffuse"].reshape(4, 35).T, rtol=1e-6)
-    np.testing.assert_allclose(whole["normals"], normals()[1:6, 2:9].reshape(35, 3), atol=2.5e-5)  # 16 bits
+    expected = {
+        kind: images.mean(axis=3)[:, 1:6, 2:9] / 65535 for kind, images in cycles_images.items()
+    }
+    np.testing.assert_allclose(
+        whole["observations"], expected["diffuse"].reshape(4, 35).T, rtol=1e-6
+    )
+    # 16 bits
+    np.testing.assert_allclose(whole["normals"], normals()[1:6, 2:9].reshape(35, 3), atol=2.5e-5)
     # PRPS gives rows 2 and 4 and columns 2, 4, 6 and 8, as in the training of CNN-PS.
     inner = expected["specular"][:, 1::2, ::2].reshape(4, 8).T
     np.testing.assert_allclose(half["observations"], inner, rtol=1e-6)
@@ -70,7 +80,10 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     capture = make_capture("a")
     shutil.copytree(capture, "b/a")
     times = []
-    for sources in ((capture, "b", capture), ("b", capture)):  # they keep their names in another order
+    for sources in (
+        (capture, "b", capture),
+        ("b", capture),
+    ):  # they keep their names in another order
         assert run("prepare", *sources, "-o", "set", "--quiet").code == 0
         assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
         times.append([Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")])
@@ -78,8 +91,12 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
 
 
 CHANGES = {
-    "ambient": lambda folder: cv2.imwrite(str(folder / "ambient.png"), np.full((24, 24), 600, np.uint16)),
-    "truth": lambda folder: np.save(folder / "normals_gt.npy", np.load(folder / "normals_gt.npy")[::-1]),
+    "ambient": lambda folder: cv2.imwrite(
+        str(folder / "ambient.png"), np.full((24, 24), 600, np.uint16)
+    ),
+    "truth": lambda folder: np.save(
+        folder / "normals_gt.npy", np.load(folder / "normals_gt.npy")[::-1]
+    ),
 }
 
 
@@ -94,8 +111,14 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
     summary = json.loads(result.out)
     hint = "Add --update to read it again, or choose another -o."
     message = f"one: its files changed since the entry one was made. {hint}"
-    assert (result.code, result.err) == (5, f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n")
-    assert (summary["entries"], summary["skipped"]) == (2, [{"source": "one", "reason": message, "exit_code": 5}])
+    assert (result.code, result.err) == (
+        5,
+        f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n",
+    )
+    assert (summary["entries"], summary["skipped"]) == (
+        2,
+        [{"source": "one", "reason": message, "exit_code": 5}],
+    )
     np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
     assert run("prepare", one, two, "-o", "set", "--update", "--quiet").code == 0
     after = arrays("one")
@@ -116,7 +139,9 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     np.testing.assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
     refused = run("prepare", capture, "-o", "raw")
-    assert refused.code == 5 and "was made with reading = 'as stored', not 'restored'" in refused.err
+    assert (
+        refused.code == 5 and "was made with reading = 'as stored', not 'restored'" in refused.err
+    )
 
 
 @pytest.fixture
@@ -153,7 +178,10 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
     assert Path("set/scene0001-diffuse").is_dir()
     refused = run(*arguments, "--scenes", 2, "--seed", 1)
-    assert (refused.code, "the entry cube-diffuse was made with seed = 0, not 1. Choose" in refused.err) == (5, True)
+    assert (
+        refused.code,
+        "the entry cube-diffuse was made with seed = 0, not 1. Choose" in refused.err,
+    ) == (5, True)
 
 
 def test_workers_render_the_same_set(run, cube):
@@ -173,7 +201,9 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
     result = run("prepare", "--mesh", "back.obj", "--size", 16, "--n-lights", 20, "-o", "set")
     assert (result.code, result.out) == (3, "")
-    assert result.err.startswith("splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z")
+    assert result.err.startswith(
+        "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
+    )
 
 
 def test_refusals(refuse, make_capture, cycles_images):

@@ -1,4 +1,6 @@
-"""What an earlier run has left is skipped, kept, redone or refused; `splinecli watch` computes what arrives once."""
+"""What an earlier run has left is skipped, kept, redone or refused; `splinecli watch` computes what
+arrives once.
+"""
 
 import json
 import os
@@ -60,7 +62,9 @@ def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
 
 CHANGES = {
     "made with another --n-lights": lambda _: ("--n-lights", "4"),
-    "other input files": lambda capture: replace_in(capture / "light_directions.txt", "\n", " # anew\n"),
+    "other input files": lambda capture: replace_in(
+        capture / "light_directions.txt", "\n", " # anew\n"
+    ),
     "made by version 0.0.": lambda capture: replace_in(
         Path("out") / capture / "report.json", '"version": "', '"version": "0.0.'
     ),
@@ -81,7 +85,10 @@ def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason,
     line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
     assert reason in line
     assert "Add --update to redo what changed, --overwrite to redo everything" in line
-    assert (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere"))) == before
+    assert (
+        Path("out/sphere/normals.npy").stat().st_mtime_ns,
+        read_report(Path("out/sphere")),
+    ) == before
     first, *_ = json.loads(run(*call, *extra, "--json").out)
     assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
     updated = run(*call, *extra, "--update")
@@ -107,7 +114,11 @@ UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "linked report": ("report.json", link_elsewhere, "has no report.json"),
     "missing": ("normals.png", Path.unlink, "normals.png is missing"),
     "linked": ("normals.npy", link_elsewhere, "normals.npy is missing"),
-    "cut short": ("normals.npy", lambda path: os.truncate(path, 100), "normals.npy has another size than"),
+    "cut short": (
+        "normals.npy",
+        lambda path: os.truncate(path, 100),
+        "normals.npy has another size than",
+    ),
     "no such name": ("report.json", surrogate_among_files, "\\ud800 is missing"),
 }
 
@@ -126,7 +137,11 @@ def test_an_unfinished_folder_is_computed_again(capture, run, name):
     assert {path.name for path in Path("out/sphere").iterdir()} == whole
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
     assert {path: path.read_bytes() for path in elsewhere} == elsewhere
-    sizes = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"}
+    sizes = {
+        path.name: path.stat().st_size
+        for path in Path("out/sphere").iterdir()
+        if path.suffix != ".json"
+    }
     assert read_report(Path("out/sphere"))["file_sizes"] == sizes
     assert "already done, skipped" in run(*call).err
 
@@ -135,7 +150,10 @@ def test_an_edited_mask_and_an_integrated_surface_stay(capture, run):
     (capture / "mask.png").unlink()
     call = ("infer", capture, "--method", "ls", "--auto-mask", "--surface")
     assert run(*call, "--overwrite").code == 0
-    assert run("integrate", "out/sphere", "--format", "ply", "--discontinuity", 0, "--overwrite").code == 0
+    assert (
+        run("integrate", "out/sphere", "--format", "ply", "--discontinuity", 0, "--overwrite").code
+        == 0
+    )
     assert run("integrate", "out/sphere", "--format", "ply", "--overwrite").code == 0
     with Path("out/sphere/found_mask.png").open("ab") as file:
         file.write(b"edited")
@@ -149,17 +167,29 @@ def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, 
     Path("out/sphere").symlink_to(Path("elsewhere").absolute())
     for overwrite in ((), ("--overwrite",)):
         result = run("infer", capture, "second", "--method", "ls", *overwrite)
-        assert (result.code, "out/sphere: found a link, expected a folder" in result.err) == (5, True)
+        assert (result.code, "out/sphere: found a link, expected a folder" in result.err) == (
+            5,
+            True,
+        )
         assert Path("out/second/report.json").is_file()
         assert not list(Path("elsewhere").iterdir())
 
 
 BAD_REPORTS = [
-    ("files", [1, 2]), ("files", ["\ud800"]), ("files", ["../../kept"]), ("files", {"a": 1}),
-    ("file_sizes", 5), ("file_sizes", None), ("warnings", [1]), ("warnings", [{"text": ["\ud800"]}]),
-    ("seconds", {"read": "x"}), ("n_pixels", "\ud800"), ("angular_error_deg", {"mean": []}),
-    ("capture", "\ud800"), ("error", ["\ud800"]),
-]  # fmt: skip
+    ("files", [1, 2]),
+    ("files", ["\ud800"]),
+    ("files", ["../../kept"]),
+    ("files", {"a": 1}),
+    ("file_sizes", 5),
+    ("file_sizes", None),
+    ("warnings", [1]),
+    ("warnings", [{"text": ["\ud800"]}]),
+    ("seconds", {"read": "x"}),
+    ("n_pixels", "\ud800"),
+    ("angular_error_deg", {"mean": []}),
+    ("capture", "\ud800"),
+    ("error", ["\ud800"]),
+]
 
 
 def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run):
@@ -175,7 +205,9 @@ def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run)
     assert "sphere" in page and "third" in page
     # The same where the captures themselves come next.
     assert run("infer", *names, "--method", "ls", "--update").code == 0
-    assert [json.loads(Path("out", name, "report.json").read_text())["capture"] for name in names] == names
+    assert [
+        json.loads(Path("out", name, "report.json").read_text())["capture"] for name in names
+    ] == names
     assert Path("kept").is_file()
 
 
@@ -198,7 +230,9 @@ def test_other_weights_in_the_home_folder(capture, monkeypatch, tmp_path):
         assert outcome.status == status
 
 
-def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_capture, monkeypatch) -> None:
+def test_captures_are_computed_as_they_arrive_and_only_once(
+    run, capture, make_capture, monkeypatch
+) -> None:
     """Something happens at each look at the folder; then Ctrl-C."""
     parts = Path("parts")
     (parts / "bad").mkdir(parents=True)
@@ -221,7 +255,12 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
     assert result.code == 130
     failed, again, done = map(json.loads, result.out.splitlines())
     assert (failed["capture"], failed["exit_code"]) == ("bad", 3) and again == failed
-    assert result.err.count("parts: the folder cannot be read (No such file or directory). Waiting for it.") == 1
+    assert (
+        result.err.count(
+            "parts: the folder cannot be read (No such file or directory). Waiting for it."
+        )
+        == 1
+    )
     assert "parts: the folder is there again" in result.err
     assert (done["capture"], done["method"]) == ("-first 1", "ls")
     before = Path("out/-first 1/report.json").stat().st_mtime_ns

@@ -1,4 +1,6 @@
-"""The documents of infer, integrate and evaluate are those that docs/reports.schema.json describes."""
+"""The documents of infer, integrate and evaluate are those that docs/reports.schema.json
+describes.
+"""
 
 import json
 from pathlib import Path
@@ -10,11 +12,15 @@ import pytest
 from splinecli.records.capture_warnings import WARNINGS
 from splinecli.records.documents import json_schema
 
-SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
+SCHEMA = json.loads(
+    (Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8")
+)
 
 
 def check(document: Any, name: str) -> None:
-    """Raise ValidationError if the document is not what the definition `name` of the schema says."""
+    """Raise ValidationError if the document is not what the definition `name` of the schema
+    says.
+    """
     validator = jsonschema.Draft202012Validator({**SCHEMA, "$ref": f"#/$defs/{name}"})
     validator.validate(document)
 
@@ -39,7 +45,9 @@ def test_reports_of_infer(capture, run, arguments):
 
 def test_reports_of_integrate(capture, run):
     assert run("infer", capture, "--method", "ls").code == 0
-    check(json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "SurfaceReport")
+    check(
+        json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "SurfaceReport"
+    )
 
 
 @pytest.mark.parametrize("lights", [["4"], ["4", "all"]])

@@ -17,11 +17,15 @@ from splinecli.workshop.training.run_files import RunLog
 
 @pytest.fixture(autouse=True)
 def small_runs(monkeypatch):
-    """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
+    """Tiny networks and few validation pixels: these tests are about the command, not about
+    learning.
+    """
     from splinecli.estimate.networks.config import NetworkConfig
     from splinecli.workshop.training import config, tasks
 
-    tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
+    tiny = config.TrainingConfig(
+        network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16
+    )
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
 
@@ -77,12 +81,17 @@ def test_a_run_and_its_continuation(run, monkeypatch):
 def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     write_set("set")
     write_set("more/set")
-    result = run("train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5)
+    result = run(
+        "train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5
+    )
     assert result.code == 0, result.err
     assert {path.name for path in Path("run").iterdir()} == SAVED
     values = settings()
     # A run continues from another working folder.
-    assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
+    assert values["sources"] == {
+        str(Path("set").absolute()): 1.0,
+        str(Path("more/set").absolute()): 1.0,
+    }
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
     report = document("infer", make_capture("sphere"), "--weights", "run/weights.safetensors")
@@ -95,15 +104,28 @@ def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
 
 
 def test_settings_come_from_preset_file_and_options(run, no_pictures):
-    Path("a.toml").write_text("seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n")
-    options = ["--param", "batch_size=4", "--param", "pixels.ambient_share=0", "--n-lights", 12, "--steps", 1]
+    Path("a.toml").write_text(
+        "seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n"
+    )
+    options = [
+        "--param",
+        "batch_size=4",
+        "--param",
+        "pixels.ambient_share=0",
+        "--n-lights",
+        12,
+        "--steps",
+        1,
+    ]
     assert run("train", "-o", "run", "--config", "a.toml", *options, "--quiet").code == 0
     values = settings()
     assert (values["seed"], values["batch_size"], values["steps"]) == (4, 4, 1)
     assert (values["pixels"]["wall_share"], values["pixels"]["ambient_share"]) == (0.25, 0)
     assert (values["pixels"]["min_lights"], values["pixels"]["max_lights"]) == (12, 12)
     # The configuration of one run starts another.
-    assert run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
+    assert (
+        run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
+    )
     assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
 
 
@@ -119,7 +141,9 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     from splinecli.workshop.training import loop as training_run
 
-    monkeypatch.setattr(training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device))
+    monkeypatch.setattr(
+        training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device)
+    )
     result = run("train", "-o", "run", "--steps", 1)
     assert (result.code, result.out) == (2, "")
     assert "3 processes cannot share the 4 shards" in result.err
@@ -147,14 +171,19 @@ def test_resuming_a_finished_run_says_so(run, no_pictures):
     assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
 
 
-@pytest.mark.parametrize("damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"])
+@pytest.mark.parametrize(
+    "damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"]
+)
 def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
     assert run("train", "-o", "run", "--steps", 1, "-q").code == 0
     damaged = Path("run/metrics.csv").read_bytes() + damage
     Path("run/metrics.csv").write_bytes(damaged)
     result = run("train", "-o", "run", "--resume", "--steps", 2)
     assert result.code == 0
-    assert "splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv" in result.err
+    assert (
+        "splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv"
+        in result.err
+    )
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
     assert steps() == ["2"]
 

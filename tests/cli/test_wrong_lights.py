@@ -1,4 +1,6 @@
-"""Wrong and rough light files on the command line: the option that mends them is named; --strict makes them errors."""
+"""Wrong and rough light files on the command line: the option that mends them is named; --strict
+makes them errors.
+"""
 
 import json
 from pathlib import Path
@@ -50,13 +52,17 @@ def test_strict_writes_nothing_and_ends_with_3(run, medallion):
 
 
 @pytest.mark.parametrize("options", [(), ("--intensities", "equal")])
-def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(run, medallion, options):
+def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
+    run, medallion, options
+):
     (medallion / "light_intensities.txt").unlink()
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
         cv2.imwrite(path, np.rint(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)).astype(np.uint16))
     for command in (("info", medallion), ("infer", medallion, "--method", "ls")):
-        assert "light" not in run(*command, *options).err.replace("The light intensities were estimated", "")
+        assert "light" not in run(*command, *options).err.replace(
+            "The light intensities were estimated", ""
+        )
     write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
     for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):
         found = run(*command, *options).err
@@ -79,7 +85,10 @@ def test_info_lists_the_readings(run, medallion):
     assert "x and y exchanged  " in wrong.out
     assert "in reversed order, beginning with light" in wrong.out
     assert "advantage: evidence from curl and outline" in wrong.out
-    assert f"splinecli: {medallion}: an input is probably wrong (light_frame), as the warnings say" in wrong.err
+    assert (
+        f"splinecli: {medallion}: an input is probably wrong (light_frame), as the warnings say"
+        in wrong.err
+    )
 
 
 def test_mended_lights(run, medallion):
@@ -97,30 +106,44 @@ def test_mended_lights(run, medallion):
     assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
     for name in ("mended.lp", "mended.npy"):
         assert run("info", medallion, "--mended-lights", name).code == 0
-        again = run("infer", medallion, "--lights", name, "--method", "ls", "--strict", "-o", name[-3:])
+        again = run(
+            "infer", medallion, "--lights", name, "--method", "ls", "--strict", "-o", name[-3:]
+        )
         assert (again.code, again.err) == (0, "")
-        np.testing.assert_allclose(read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5)
+        np.testing.assert_allclose(
+            read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5
+        )
     for suffix in ("json", "mat", "yml", "xml"):
         refused = run("info", medallion, "--mended-lights", f"mended.{suffix}")
-        assert (refused.code, f"of the type .{suffix} are only read. Write .txt" in refused.err) == (2, True)
+        assert (
+            refused.code,
+            f"of the type .{suffix} are only read. Write .txt" in refused.err,
+        ) == (2, True)
         assert not Path(f"mended.{suffix}").exists()
 
 
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     usual = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "-o", "usual")
     assert usual.code == 0 and "not be checked" not in usual.err
-    few = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "--strict", "--json")
+    few = run(
+        "infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "--strict", "--json"
+    )
     assert few.code == 0
     warning, other = json.loads(few.out)[0]["warnings"]
     assert (warning["code"], other["code"]) == ("lights_unchecked", "few_lights")
-    assert warning["text"].endswith("their order (fewer than 6 lights, too few lit pixels, or a flat object).")
+    assert warning["text"].endswith(
+        "their order (fewer than 6 lights, too few lit pixels, or a flat object)."
+    )
     mask = np.zeros((128, 128), np.uint8)
     mask[40:90, 40:90] = 255
     cv2.imwrite(str(medallion / "mask.png"), mask)
     write_lights(medallion, lambda lights: lights * (-1, -1, 1))
     relief = run("info", medallion, "--strict")
     assert relief.code == 0
-    assert "The lights of light_directions.txt could not be fully verified. Unchecked: whether x and y" in relief.err
+    assert (
+        "The lights of light_directions.txt could not be fully verified. Unchecked: whether x and y"
+        in relief.err
+    )
 
 
 def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
@@ -160,12 +183,16 @@ def test_an_image_that_contradicts_the_others_is_named(run, medallion):
     assert report["warning_codes"] == ["image_inconsistent"]
     assert "07.png contradicts the other images and is 0.4" in report["warnings"][0]
     left_out = ",".join(str(place) for place in range(10) if place != 6)
-    assert run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0
+    assert (
+        run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0
+    )
 
 
 @pytest.fixture
 def rough() -> np.ndarray:
-    """Write a matte bump under distant lights. Returns directions (7, 3) with errors of about 5 degrees."""
+    """Write a matte bump under distant lights. Returns directions (7, 3) with errors of about 5
+    degrees.
+    """
     write_bump(Path("bump"), distant=True)
     directions = BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
     Path("bump/light_intensities.txt").write_text("1\n" * len(directions))
@@ -178,7 +205,9 @@ def test_infer(document, rough: np.ndarray) -> None:
     command = ("infer", "bump", "--method", "ls", "--overwrite")
     given, refined = (document(*command, *more) for more in ((), ("--refine-lights",)))
     np.testing.assert_allclose(given["light_directions"], rough, atol=1e-5)
-    moved = np.degrees(np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1)))
+    moved = np.degrees(
+        np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1))
+    )
     assert 1 < moved.mean() < 10
     assert "refined_lights" in [warning["code"] for warning in refined["warnings"]]
     # A common rotation of lights and normals stays.
@@ -222,4 +251,6 @@ def test_a_black_patch_amid_the_object(run, medallion):
         cv2.imwrite(str(path), image)
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0
-    assert "black_pixels" in [warning["code"] for warning in read_report(Path("out/medallion"))["warnings"]]
+    assert "black_pixels" in [
+        warning["code"] for warning in read_report(Path("out/medallion"))["warnings"]
+    ]

@@ -29,7 +29,9 @@ def draw_lights(count: int = 12) -> Float64Array:
 
 
 def relief(lights: Float64Array, *, widths: float | None = None) -> Capture:
-    """Return a matte relief without cast shadows, under distant lights, or under lamps so many widths away."""
+    """Return a matte relief without cast shadows, under distant lights, or under lamps so many
+    widths away.
+    """
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, SIZE), np.linspace(0.5, -0.5, SIZE))
     heights = 0.03 * np.sin(9 * x) * np.cos(8 * y)
     slopes = 0.27 * np.cos(9 * x) * np.cos(8 * y), -0.24 * np.sin(9 * x) * np.sin(8 * y)
@@ -44,7 +46,14 @@ def relief(lights: Float64Array, *, widths: float | None = None) -> Capture:
     noise = 1 + 0.002 * np.random.default_rng(2).normal(size=shading.shape)
     observations = (albedo * shading.clip(min=0) * noise).clip(min=0).astype(np.float32)
     truth = normals.reshape(SIZE, SIZE, 3).astype(np.float32)
-    return Capture("relief", observations, lights, tuple(range(len(lights))), np.ones((SIZE, SIZE), np.bool_), truth)
+    return Capture(
+        "relief",
+        observations,
+        lights,
+        tuple(range(len(lights))),
+        np.ones((SIZE, SIZE), np.bool_),
+        truth,
+    )
 
 
 def encoded(capture: Capture) -> Capture:
@@ -66,7 +75,8 @@ def features(capture: Capture) -> CaptureFeatures:
 def test_each_fault_shows_in_its_own_feature() -> None:
     lights = draw_lights()
     right, near, bent = (
-        features(capture) for capture in (relief(lights), relief(lights, widths=5), encoded(relief(lights)))
+        features(capture)
+        for capture in (relief(lights), relief(lights, widths=5), encoded(relief(lights)))
     )
     assert abs(right.nearness) < 0.01
     assert near.nearness == pytest.approx(1 / 5, rel=0.15)  # to first order in width over distance
@@ -76,7 +86,9 @@ def test_each_fault_shows_in_its_own_feature() -> None:
     assert bent.decoding < np.log(0.5) < right.decoding
     unequal = relief(lights)
     stops = np.random.default_rng(4).normal(0, 0.3, len(lights))
-    dimmed = features(replace(unequal, observations=(unequal.observations * 2**stops).astype(np.float32)))
+    dimmed = features(
+        replace(unequal, observations=(unequal.observations * 2**stops).astype(np.float32))
+    )
     assert dimmed.light_misfit > right.light_misfit + 1.5
     assert dimmed.free_light_misfit < dimmed.light_misfit - 1.5
 

@@ -52,8 +52,12 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
     assert max(done) <= tile_pixels
 
 
-@pytest.mark.parametrize(("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)])
-def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most) -> None:
+@pytest.mark.parametrize(
+    ("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
+)
+def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(
+    near, n_lights, most
+) -> None:
     """Under near lamps, every pixel has its own directions, which would take gigabytes."""
     asked = []
 

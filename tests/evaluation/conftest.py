@@ -1,4 +1,6 @@
-"""An analytic capture: a convex Lambertian dome, every light seen from everywhere, so that least squares is exact."""
+"""An analytic capture: a convex Lambertian dome, every light seen from everywhere, so that least
+squares is exact.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,11 +23,17 @@ def dome_normals() -> NDArray[np.float64]:
 
 @pytest.fixture
 def write_dome(tmp_path: Path) -> Callable[..., Path]:
-    """Write a capture folder below tmp_path: 16-bit images, mask, lights, and ground truth by default."""
+    """Write a capture folder below tmp_path: 16-bit images, mask, lights, and ground truth by
+    default.
+    """
 
-    def write(name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0) -> Path:
+    def write(
+        name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0
+    ) -> Path:
         lights, normals = spiral_lights(n_lights, 40, 15), dome_normals()
-        photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(np.uint16)
+        photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(
+            np.uint16
+        )
         mask = np.pad(np.ones((SIZE - 2, SIZE - 2), bool), 1)
         normals[1, 1 : 1 + without_truth] = 0
         truth = normals if ground_truth else None

@@ -1,4 +1,6 @@
-"""Draws of lights: what they depend on, every complaint about a draws file, and the white level of each draw."""
+"""Draws of lights: what they depend on, every complaint about a draws file, and the white level of
+each draw.
+"""
 
 from pathlib import Path
 
@@ -47,13 +49,16 @@ def test_a_draw_is_rising_distinct_indices(n_lights: int, seed: int) -> None:
 
 
 def test_more_trials_continue_the_list() -> None:
-    assert draw_lights(LIGHTS, 10, trials=30, seed=4)[:7] == draw_lights(LIGHTS, 10, trials=7, seed=4)
+    assert draw_lights(LIGHTS, 10, trials=30, seed=4)[:7] == draw_lights(
+        LIGHTS, 10, trials=7, seed=4
+    )
 
 
 def test_every_light_is_equally_likely() -> None:
     trials, share = 2000, 10 / 96
     counts = np.bincount(np.ravel(draw_lights(LIGHTS, 10, trials=trials, seed=0)), minlength=96)
-    # Each count is binomial; the largest of 96 deviations beyond 4.5 standard deviations has a chance of 0.07 %.
+    # Each count is binomial; the largest of 96 deviations beyond 4.5 standard deviations has a
+    # chance of 0.07 %.
     assert np.abs(counts - trials * share).max() < 4.5 * np.sqrt(trials * share * (1 - share))
 
 
@@ -87,7 +92,11 @@ def write(tmp_path: Path, text: str) -> Path:
 
 def test_a_draws_file(tmp_path: Path) -> None:
     file = read_draws(write(tmp_path, "# ours\n0 3 5\n\n 95,1,  2  # in any order\n7\t8;9"))
-    assert (file.draws, file.lines, file.n_lights) == (((0, 3, 5), (95, 1, 2), (7, 8, 9)), (2, 4, 5), 3)
+    assert (file.draws, file.lines, file.n_lights) == (
+        ((0, 3, 5), (95, 1, 2), (7, 8, 9)),
+        (2, 4, 5),
+        3,
+    )
     file.check_against(LIGHTS)
 
 
@@ -117,12 +126,20 @@ LS = make_estimator("ls")
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A matte sphere under nine lights. The camera clips three images at 6000; the others are too dark for that."""
+    """A matte sphere under nine lights. The camera clips three images at 6000; the others are too
+    dark for that.
+    """
     normals, lights = sphere_cap(SIDE), spiral_lights(N_LIGHTS, 50)
     rng = np.random.default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE, 1))
     intensities = np.where(np.arange(N_LIGHTS) < CLIPPED, 1.6, 0.5)
-    values = intensities * LEVEL * albedo * shade(normals, lights) * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
+    values = (
+        intensities
+        * LEVEL
+        * albedo
+        * shade(normals, lights)
+        * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
+    )
     images = np.moveaxis(np.minimum(np.rint(values), LEVEL).astype(np.uint16), 2, 0)
     assert ((images == LEVEL).any(axis=(1, 2)) == (np.arange(N_LIGHTS) < CLIPPED)).all()
     colours = np.repeat(intensities[:, None], 3, axis=1)
@@ -159,7 +176,10 @@ def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder: P
     stored = open_capture(folder).read_stored()
     assert stored.capture.white_level == WhiteLevel(LEVEL, "images")
     dim = stored.choose_lights([1, 4, 5, 6, 8])
-    assert (dim.capture.white_level, dim.saturation.flags) == (WhiteLevel(65_535, "full scale"), None)
+    assert (dim.capture.white_level, dim.saturation.flags) == (
+        WhiteLevel(65_535, "full scale"),
+        None,
+    )
     rows = np.arange(0, SIDE * SIDE, 7)
     bright = stored.choose_lights([2, 4, 0, 1]).choose_pixels(rows).choose_pixels(np.arange(5, 300))
     alone = open_capture(folder).read_stored([2, 4, 0, 1])

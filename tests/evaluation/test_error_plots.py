@@ -15,11 +15,21 @@ METHODS = ("ls", "spline-net")
 
 
 def evaluation_of(
-    captures: list[str], n_lights: int | None = 10, light_noise_deg: float = 0.0, *, all_lights: int = 96
+    captures: list[str],
+    n_lights: int | None = 10,
+    light_noise_deg: float = 0.0,
+    *,
+    all_lights: int = 96,
 ) -> Evaluation:
     level = 20 / (n_lights or all_lights) + light_noise_deg
     results = tuple(
-        Result(method, capture, n_lights or all_lights, (m + level, m + level + 0.5, m + level + 1), 1.0)
+        Result(
+            method,
+            capture,
+            n_lights or all_lights,
+            (m + level, m + level + 0.5, m + level + 1),
+            1.0,
+        )
         for capture, (m, method) in product(captures, enumerate(METHODS, start=3))
     )
     return Evaluation(Protocol(n_lights, 3, light_noise_deg=light_noise_deg), results)
@@ -32,9 +42,17 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize(
     ("captures", "across", "down"),
-    [(["ball"], 1, 1), (["ball", "cat"], 3, 1), (list("abc"), 2, 2), (list("abcd"), 3, 2), (list("abcde"), 1, 1)],
+    [
+        (["ball"], 1, 1),
+        (["ball", "cat"], 3, 1),
+        (list("abc"), 2, 2),
+        (list("abcd"), 3, 2),
+        (list("abcde"), 1, 1),
+    ],
 )
-def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: int, down: int) -> None:
+def test_a_panel_for_each_capture_and_the_average(
+    captures: list[str], across: int, down: int
+) -> None:
     picture = decode_rgb(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
     assert picture.shape == (540 * down + 80, 640 * across, 3) and (picture[0] == 255).all()
 

@@ -23,30 +23,46 @@ def all_of(page: HtmlPage, tag: str) -> list[dict[str, str | None]]:
     return [attributes for name, attributes in page.tags if name == tag]
 
 
-def evaluation_of(methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10) -> Evaluation:
+def evaluation_of(
+    methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10
+) -> Evaluation:
     generator = np.random.default_rng(3)
     results = tuple(
-        Result(method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25)
+        Result(
+            method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25
+        )
         for capture, (m, method) in product(captures, enumerate(methods))
     )
     protocol = Protocol(n_lights, trials, seed=7, max_pixels=500)
-    return Evaluation(protocol, results, (SkippedCapture(capture="bear", reason="bear: no images."),))
+    return Evaluation(
+        protocol, results, (SkippedCapture(capture="bear", reason="bear: no images."),)
+    )
 
 
 def test_one_evaluation() -> None:
     page = HtmlPage(
-        html_report([evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."])
+        html_report(
+            [evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."]
+        )
     )
     assert page.text["h1"] == ["Photometric stereo: 2 methods on 2 captures"]
     protocol = dict(zip(page.text["dt"], page.text["dd"], strict=True))
     assert protocol == {
-        "Methods": "ls, iw12", "Captures": "ball, cat", "Lights": "10 lights", "Trials": "4", "Seed": "7",
-        "Image values":
-            "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does",
-        "Draws of lights": "at random from the seed, the same for all methods", "Light noise": "none",
-        "Pixels scored": "at most 500 of each capture, at random", "splinecli": __version__,
-    }  # fmt: skip
-    assert {"Notes", "Skipped captures", "Results with 10 lights", "Figures"} <= set(page.text["h2"])
+        "Methods": "ls, iw12",
+        "Captures": "ball, cat",
+        "Lights": "10 lights",
+        "Trials": "4",
+        "Seed": "7",
+        "Image values": "lens blur removed, saturated observations restored, unknown light"
+        " intensities estimated, as infer does",
+        "Draws of lights": "at random from the seed, the same for all methods",
+        "Light noise": "none",
+        "Pixels scored": "at most 500 of each capture, at random",
+        "splinecli": __version__,
+    }
+    assert {"Notes", "Skipped captures", "Results with 10 lights", "Figures"} <= set(
+        page.text["h2"]
+    )
     assert {"Ball is round.", ": bear: no images."} <= set(page.text["li"])
     assert any(words.startswith("ls is better than iw12 by") for words in page.text["li"])
     assert page.text["figcaption"] == ["A plot"]
@@ -60,7 +76,10 @@ def test_several_evaluations_begin_with_their_averages() -> None:
     evaluations.append(evaluation_of(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
     page = HtmlPage(html_report(evaluations, [], []))
     headings = page.text["h2"]
-    assert headings[-4:] == ["Averages over the captures", *(f"Results with {k} lights" for k in (4, 10, "all"))]
+    assert headings[-4:] == [
+        "Averages over the captures",
+        *(f"Results with {k} lights" for k in (4, 10, "all")),
+    ]
     assert "Notes" not in headings
     assert "Figures" not in headings
     assert "4 or 1" in page.text["dd"]  # trials
@@ -93,7 +112,8 @@ def test_it_stands_alone() -> None:
 @pytest.mark.parametrize("name", ["<b>&", '"><script>alert(1)</script>', "{{ 7 * 7 }}", "a'b"])
 def test_names_are_text(name: str) -> None:
     evaluation = replace(
-        evaluation_of([name, "ls"], [name + "1", "ball"]), skipped=(SkippedCapture(capture=name, reason=name),)
+        evaluation_of([name, "ls"], [name + "1", "ball"]),
+        skipped=(SkippedCapture(capture=name, reason=name),),
     )
     page = HtmlPage(html_report([evaluation], [(name, PNG)], [name]))
     assert all(name in page.text[tag] for tag in ("th", "strong", "figcaption"))
@@ -105,7 +125,9 @@ def test_it_can_be_read_by_all() -> None:
     html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG)], [])
     page = HtmlPage(html)
     assert all_of(page, "html") == [{"lang": "en"}]
-    assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in all_of(page, "meta")
+    assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in all_of(
+        page, "meta"
+    )
     assert html.startswith("<!DOCTYPE html>")
     assert "prefers-color-scheme: dark" in html
     assert "@media print" in html

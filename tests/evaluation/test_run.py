@@ -1,4 +1,6 @@
-"""Whole evaluations: against analytic captures, hand-computed errors, and the published errors of DiLiGenT."""
+"""Whole evaluations: against analytic captures, hand-computed errors, and the published errors of
+DiLiGenT.
+"""
 
 import os
 from collections.abc import Callable, Sequence
@@ -27,14 +29,18 @@ class Fake(Estimator):
 
     fingerprint = "fake"
 
-    def __init__(self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake") -> None:
+    def __init__(
+        self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake"
+    ) -> None:
         self.name, self.lights, self.observations = name, list[Any](), list[Any]()
         capture = read_capture(folder)
         truth = capture.ground_truth[capture.mask]
         self._truth = truth[truth.any(axis=1)].astype(np.float64)
         self._angles = np.radians(angles_deg)
 
-    def estimate(self, observations: Any, lights: Any, *, progress: object = None) -> NDArray[np.float64]:
+    def estimate(
+        self, observations: Any, lights: Any, *, progress: object = None
+    ) -> NDArray[np.float64]:
         angle = self._angles[len(self.lights) % len(self._angles)]
         self.lights.append(lights)
         self.observations.append(observations)
@@ -50,7 +56,9 @@ class Constant(Fake):
     def __init__(self, vector: Sequence[float]) -> None:
         self.name, self._vector, self.lights = "constant", vector, []
 
-    def estimate(self, observations: Any, lights: Any, *, progress: object = None) -> NDArray[np.float64]:
+    def estimate(
+        self, observations: Any, lights: Any, *, progress: object = None
+    ) -> NDArray[np.float64]:
         self.lights.append(lights)
         return np.tile(self._vector, (len(observations), 1))
 
@@ -93,17 +101,26 @@ def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_pat
     protocol = Protocol(draws_file=tmp_path / "draws.txt")
     evaluation = evaluate(folders, [make_estimator("ls")], protocol)
     assert evaluation.captures == ("ten",)
-    problem = f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights."
+    problem = (
+        f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights."
+    )
     assert [(s.capture, s.reason) for s in evaluation.skipped] == [("eight", problem)]
 
 
 def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) -> None:
     folder = write_dome()
     errors = [
-        evaluate([folder], [make_estimator("ls")], Protocol(trials=20, light_noise_deg=sigma)).results[0]
+        evaluate(
+            [folder], [make_estimator("ls")], Protocol(trials=20, light_noise_deg=sigma)
+        ).results[0]
         for sigma in (0, 1, 4)
     ]
-    assert [result.trials for result in errors] == [1, 20, 20]  # all lights, other noise in each trial
+    # all lights, other noise in each trial
+    assert [result.trials for result in errors] == [
+        1,
+        20,
+        20,
+    ]
     assert len(set(errors[1].maes_deg)) == 20
     assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
     # The trials' noise is the same but for its size, and small errors grow in proportion.
@@ -111,24 +128,39 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) ->
 
 
 def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_path: Path) -> None:
-    good, untrue, few = (write_dome("good"), write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4))
+    good, untrue, few = (
+        write_dome("good"),
+        write_dome("untrue", ground_truth=False),
+        write_dome("few", n_lights=4),
+    )
     broken = write_dome("broken")
     (broken / "003.png").write_bytes(b"no image")
     folders = [untrue, good, broken, few, tmp_path / "missing"]
     evaluation = evaluate(folders, [make_estimator("ls")], Protocol(n_lights=5, trials=10))
     assert evaluation.captures == ("good",)
-    assert [skipped.capture for skipped in evaluation.skipped] == ["untrue", "broken", "few", "missing"]
+    assert [skipped.capture for skipped in evaluation.skipped] == [
+        "untrue",
+        "broken",
+        "few",
+        "missing",
+    ]
     reasons = [skipped.reason for skipped in evaluation.skipped]
     assert reasons[0].startswith(f"{untrue}: the capture has no ground truth.")
     assert str(broken / "003.png") in reasons[1]
-    assert reasons[2] == "the capture has 4 lights, too few for draws of 5. Use --n-lights 4, or fewer."
+    assert (
+        reasons[2]
+        == "the capture has 4 lights, too few for draws of 5. Use --n-lights 4, or fewer."
+    )
     assert str(tmp_path / "missing") in reasons[3]
 
 
 def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> None:
     ls = make_estimator("ls")
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
-    none = "none of the 2 captures could be scored; the first: .*untrue: the capture has no ground truth"
+    none = (
+        "none of the 2 captures could be scored; the first: .*untrue: the capture has no ground"
+        " truth"
+    )
     for folders, error, message in (
         ([untrue, few], InputError, none),
         ([untrue], InputError, "untrue: the capture has no ground truth"),
@@ -147,8 +179,12 @@ def test_names_tell_captures_apart(write_dome: WriteDome, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
-def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Sequence[float]) -> None:
-    with pytest.raises(SplinecliError, match="method constant gave normals that are not unit vectors"):
+def test_normals_that_are_none_are_not_scored(
+    write_dome: WriteDome, vector: Sequence[float]
+) -> None:
+    with pytest.raises(
+        SplinecliError, match="method constant gave normals that are not unit vectors"
+    ):
         evaluate([write_dome()], [Constant(vector)], Protocol())
 
 
@@ -156,11 +192,18 @@ def test_progress(write_dome: WriteDome) -> None:
     folders = [write_dome("a"), write_dome("b")]
     seen: list[tuple[float, str]] = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
-    evaluate_all(folders, [make_estimator("ls")], protocols, on_progress=lambda share, note: seen.append((share, note)))
+    evaluate_all(
+        folders,
+        [make_estimator("ls")],
+        protocols,
+        on_progress=lambda share, note: seen.append((share, note)),
+    )
     shares, notes = zip(*seen, strict=True)
     assert min(shares) == 0
     assert sum(shares) == pytest.approx(1)
-    assert [note for note in notes if "reading b" in note] == [f"reading b, image {i} of 8" for i in range(1, 9)]
+    assert [note for note in notes if "reading b" in note] == [
+        f"reading b, image {i} of 8" for i in range(1, 9)
+    ]
     assert notes[-1] == "trial 6 of 6"
 
 
@@ -171,8 +214,12 @@ def test_trials_at_a_time_change_nothing(write_dome: WriteDome) -> None:
     one_by_one = evaluate_all(folders, estimators, protocols)
     together = evaluate_all(folders, estimators, protocols, jobs=3)
     for before, after in zip(one_by_one, together, strict=True):
-        assert [(r.method, r.capture) for r in before.results] == [(r.method, r.capture) for r in after.results]
-        np.testing.assert_allclose([r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5)
+        assert [(r.method, r.capture) for r in before.results] == [
+            (r.method, r.capture) for r in after.results
+        ]
+        np.testing.assert_allclose(
+            [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
+        )
 
 
 def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> None:
@@ -188,17 +235,34 @@ def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> 
     assert len(again.lights) == 3
     # Nothing is left to do, and nothing of the first run's was lost.
     idle = Fake(folder, angles_deg=(90,))
-    assert evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path))[0] == evaluation
+    assert (
+        evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+        == evaluation
+    )
     assert idle.lights == []
-    fresh = evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path, fresh=True))[0]
+    fresh = evaluate_all(
+        [folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path, fresh=True)
+    )[0]
     assert fresh.results[0].mae_deg == pytest.approx(90, abs=1e-4)
     assert len(path.read_text().splitlines()) == 4
 
 
 @pytest.mark.parametrize(
-    "change", ["photograph", "lights", "method", "seed", "max_pixels", "light_noise_deg", "n_lights", "as_stored"]
+    "change",
+    [
+        "photograph",
+        "lights",
+        "method",
+        "seed",
+        "max_pixels",
+        "light_noise_deg",
+        "n_lights",
+        "as_stored",
+    ],
 )
-def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
+def test_a_trial_of_something_else_does_not_count(
+    write_dome: WriteDome, tmp_path: Path, change: str
+) -> None:
     folder, path = write_dome(), tmp_path / "trials.jsonl"
     settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
     evaluate_all([folder], [Constant((0, 0, 1))], [Protocol(**settings)], store=TrialStore(path))
@@ -218,7 +282,9 @@ def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_pat
 
 
 def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: WriteDome) -> None:
-    """As out of an archive whose times were normalised: names, sizes and times of all files are the same."""
+    """As out of an archive whose times were normalised: names, sizes and times of all files are the
+    same.
+    """
     folders = [write_dome("u/dome"), write_dome("v/dome")]
     for folder in folders:
         for path in folder.iterdir():
@@ -227,7 +293,9 @@ def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: Wri
                 half = (len(content) - 128) // 2  # after the header of 128 bytes
                 path.write_bytes(content[:128] + content[128 + half :] + content[128 : 128 + half])
             os.utime(path, ns=(10**18, 10**18))
-    sizes = [sorted((path.name, path.stat().st_size) for path in folder.iterdir()) for folder in folders]
+    sizes = [
+        sorted((path.name, path.stat().st_size) for path in folder.iterdir()) for folder in folders
+    ]
     assert sizes[0] == sizes[1]
     first, second = evaluate(folders, [make_estimator("ls")], Protocol()).results
     assert first.mae_deg < 0.1 < second.mae_deg
@@ -251,7 +319,9 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     fake = Fake(folders[0])
     evaluation = evaluate(folders, [fake], Protocol(skip_first={"bearPNG": 3}))
     assert [len(lights) for lights in fake.lights] == [5, 8]
-    np.testing.assert_array_equal(fake.observations[0], read_capture(folders[0]).observations[:, 3:])
+    np.testing.assert_array_equal(
+        fake.observations[0], read_capture(folders[0]).observations[:, 3:]
+    )
     assert [result.n_lights for result in evaluation.results] == [5, 8]
     assert evaluation.notes == ("bearPNG: the first 3 images were left out.",)
     every = Fake(folders[0])
@@ -259,7 +329,9 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     assert [len(lights) for lights in every.lights] == [4, 7]
 
 
-def test_draws_keep_to_the_images_that_are_not_left_out(write_dome: WriteDome, tmp_path: Path) -> None:
+def test_draws_keep_to_the_images_that_are_not_left_out(
+    write_dome: WriteDome, tmp_path: Path
+) -> None:
     folder = write_dome(n_lights=9)
     fake = Fake(folder)
     evaluate([folder], [fake], Protocol(4, trials=20, skip_first={"*": 3}))

@@ -1,6 +1,7 @@
 """The whole text of every document of an evaluation stands in tests/golden/.
 
-Paired tests are compared with a textbook's example, SciPy's two-sample form and corrections done by hand.
+Paired tests are compared with a textbook's example, SciPy's two-sample form and corrections done by
+hand.
 """
 
 import csv
@@ -16,7 +17,16 @@ from scipy import stats
 
 from splinecli.evaluation.document import html_report, results_csv, results_document
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
-from splinecli.evaluation.tables import AVERAGE, best_cells, compare, holm, latex, markdown, table_rows, trial_averages
+from splinecli.evaluation.tables import (
+    AVERAGE,
+    best_cells,
+    compare,
+    holm,
+    latex,
+    markdown,
+    table_rows,
+    trial_averages,
+)
 from splinecli.records.documents import SkippedCapture
 
 TEN = Evaluation(
@@ -42,8 +52,9 @@ ALL = Evaluation(
 
 
 def test_whole_documents(golden: Callable[[str, str], None]) -> None:
-    """Of the comparisons by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree of freedom, where t's
-    distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5 tan(0.95 pi / 2) = 6.3531."""
+    """Of the comparisons by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree
+    of freedom, where t's distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5
+    tan(0.95 pi / 2) = 6.3531."""
     both = [TEN, ALL]
     for suffix, text in (
         ("md", markdown(both)),
@@ -66,7 +77,10 @@ def test_rows_for_a_terminal() -> None:
 
 @pytest.mark.parametrize(
     ("name", "shown"),
-    [("a|b", r"a\|b"), ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~")],
+    [
+        ("a|b", r"a\|b"),
+        ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
+    ],
 )
 def test_names_are_text_in_markdown(name: str, shown: str) -> None:
     odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))
@@ -79,7 +93,11 @@ def test_light_noise_tells_evaluations_apart() -> None:
     assert document["protocol"]["n_lights"] == 10
     assert document["protocol"]["light_noise_deg"] == [0.0, 2.5]
     assert list(document["averages"]["ls"]) == ["0", "2.5"]
-    assert list(results_document([TEN, ALL, noisy])["averages"]["ls"]) == ["10, 0", "all, 0", "10, 2.5"]
+    assert list(results_document([TEN, ALL, noisy])["averages"]["ls"]) == [
+        "10, 0",
+        "all, 0",
+        "10, 2.5",
+    ]
     assert "## 10 lights, light noise of 2.5 degrees\n" in markdown([TEN, noisy])
 
 
@@ -93,7 +111,11 @@ def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> Non
     assert {record["as_stored"] for record in document["results"]} == {as_stored}
     rows = csv.DictReader(results_csv([evaluation]).splitlines())
     assert {row["as_stored"] for row in rows} == {str(as_stored)}
-    shown = "as stored: nothing restored" if as_stored else "lens blur removed, saturated observations restored"
+    shown = (
+        "as stored: nothing restored"
+        if as_stored
+        else "lens blur removed, saturated observations restored"
+    )
     assert shown in html_report([evaluation], [], [])
 
 
@@ -128,7 +150,8 @@ def test_students_example() -> None:
     assert comparison.p_value == pytest.approx(0.002833, abs=5e-7)
     assert comparison.interval_deg == pytest.approx((-2.4598858, -0.7001142), abs=5e-8)
     assert comparison.difference_deg == pytest.approx(-1.58)
-    assert comparison.std_deg == pytest.approx(np.sqrt(13.616 / 10))  # squares about the mean, by hand
+    # squares about the mean, by hand
+    assert comparison.std_deg == pytest.approx(np.sqrt(13.616 / 10))
     assert (comparison.first, comparison.second, comparison.trials) == ("ls", "iw12", 10)
     assert comparison.p_holm == comparison.p_value  # one pair
     assert comparison.differs
@@ -146,16 +169,23 @@ def test_holm_by_hand() -> None:
 def test_every_pair_on_every_capture_and_on_their_average() -> None:
     generator = np.random.default_rng(1)
     draws = {
-        capture: {method: tuple(generator.normal(mean, 0.5, 8)) for method, mean in (("a", 5), ("b", 6), ("c", 5.2))}
+        capture: {
+            method: tuple(generator.normal(mean, 0.5, 8))
+            for method, mean in (("a", 5), ("b", 6), ("c", 5.2))
+        }
         for capture in ("ball", "cat", "cow")
     }
     comparisons = compare(evaluation_of(**draws))
     assert [(c.capture, c.first, c.second) for c in comparisons] == [
-        (capture, *pair) for capture in ("ball", "cat", "cow", AVERAGE) for pair in (("a", "b"), ("a", "c"), ("b", "c"))
+        (capture, *pair)
+        for capture in ("ball", "cat", "cow", AVERAGE)
+        for pair in (("a", "b"), ("a", "c"), ("b", "c"))
     ]
     for c in comparisons:
         captures = draws.values() if c.capture == AVERAGE else [draws[c.capture]]
-        first, second = (np.mean([methods[m] for methods in captures], axis=0) for m in (c.first, c.second))
+        first, second = (
+            np.mean([methods[m] for methods in captures], axis=0) for m in (c.first, c.second)
+        )
         oracle = stats.ttest_rel(first, second)
         assert c.p_value == pytest.approx(oracle.pvalue)
         assert c.interval_deg == pytest.approx(tuple(oracle.confidence_interval(0.95)))
@@ -187,7 +217,9 @@ def test_pairs_without_a_test_do_not_count_in_the_correction() -> None:
     on_ball = {(c.first, c.second): c for c in comparisons if c.capture == "ball"}
     assert on_ball["a", "c"].p_holm is None
     tested = [on_ball["a", "b"], on_ball["b", "c"]]
-    assert [each.p_holm for each in tested] == pytest.approx(holm([each.p_value for each in tested]))
+    assert [each.p_holm for each in tested] == pytest.approx(
+        holm([each.p_value for each in tested])
+    )
 
 
 def test_the_average_takes_the_trials_all_captures_have() -> None:

@@ -1,4 +1,6 @@
-"""What a trial scores: pixels with ground truth, or a part of them, under lights with noise of the stated size."""
+"""What a trial scores: pixels with ground truth, or a part of them, under lights with noise of the
+stated size.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ MASK = np.random.default_rng(5).random((9, 7)) < 0.7
 
 @pytest.fixture
 def capture() -> Capture:
-    """Observation 0 of a pixel is its flat index in the image; columns 3 and 4 have no ground truth."""
+    """Observation 0 of a pixel is its flat index in the image; columns 3 and 4 have no ground
+    truth.
+    """
     index = np.flatnonzero(MASK)
     truth = np.zeros((9, 7, 3), np.float32)
     truth[..., 2] = 1
@@ -28,7 +32,11 @@ def test_pixels_without_ground_truth_go(capture: Capture) -> None:
     wanted[:, 3:5] = False
     rows = scored_rows(capture)
     np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
-    kept = StoredCapture(capture, Saturation(capture.n_pixels, ()), intensities_known=True).choose_pixels(rows).capture
+    kept = (
+        StoredCapture(capture, Saturation(capture.n_pixels, ()), intensities_known=True)
+        .choose_pixels(rows)
+        .capture
+    )
     np.testing.assert_array_equal(kept.mask, wanted)
     np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)

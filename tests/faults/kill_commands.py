@@ -1,4 +1,5 @@
-"""Kill every command while it replaces earlier output: `python tests/faults/kill_commands.py --kills 200`.
+"""Kill every command while it replaces earlier output: `python tests/faults/kill_commands.py
+--kills 200`.
 
 A kill comes before a change of a file, or at a random time. After it,
 
@@ -6,8 +7,8 @@ A kill comes before a change of a file, or at a random time. After it,
 - the files are all of one run, or the folder has no report;
 - after the next start has locked the folder, it has no hidden file.
 
-Then the same command runs again, and must end with the same files as an undisturbed run. An undisturbed run must also
-sync every file before it renames it.
+Then the same command runs again, and must end with the same files as an undisturbed run. An
+undisturbed run must also sync every file before it renames it.
 """
 
 import argparse
@@ -42,7 +43,8 @@ class Replacement:
     old: str  # the commands
     new: str
     folder: str = "out"  # the folder that the command holds
-    report: str | None = "report.json"  # the file that describes the others. None if files are replaced one by one
+    # the file that describes the others. None if files are replaced one by one
+    report: str | None = "report.json"
 
 
 _INFER = "infer capture --method ls -o out --overwrite -q"
@@ -53,11 +55,21 @@ _PREPARE = "prepare -o out/set -q"
 _INFO = "info --plot out/p.png -q"
 _TRAIN = "train set -o out/run -q --config a.toml"
 REPLACEMENTS = {
-    "infer": Replacement("earlier", _INFER, f"{_INFER} --format png8,tiff --maps preview", "out/capture"),
-    "calibrate": Replacement("ball", f"{_CALIBRATE} --gray-ball gray", _CALIBRATE, report="calibration.json"),
-    "integrate": Replacement("normals", f"{_INTEGRATE} ply,npy", f"{_INTEGRATE} obj,npy", report="surface.json"),
-    "evaluate": Replacement("earlier", f"{_EVALUATE} 1", f"{_EVALUATE} 2 --n-lights 5", report="results.json"),
-    "prepare": Replacement("earlier", f"{_PREPARE} capture", f"{_PREPARE} capture more", "out/set", "manifest.json"),
+    "infer": Replacement(
+        "earlier", _INFER, f"{_INFER} --format png8,tiff --maps preview", "out/capture"
+    ),
+    "calibrate": Replacement(
+        "ball", f"{_CALIBRATE} --gray-ball gray", _CALIBRATE, report="calibration.json"
+    ),
+    "integrate": Replacement(
+        "normals", f"{_INTEGRATE} ply,npy", f"{_INTEGRATE} obj,npy", report="surface.json"
+    ),
+    "evaluate": Replacement(
+        "earlier", f"{_EVALUATE} 1", f"{_EVALUATE} 2 --n-lights 5", report="results.json"
+    ),
+    "prepare": Replacement(
+        "earlier", f"{_PREPARE} capture", f"{_PREPARE} capture more", "out/set", "manifest.json"
+    ),
     "info": Replacement("earlier", f"{_INFO} capture", f"{_INFO} more --overwrite", report=None),
     "train": Replacement("training", _TRAIN, f"{_TRAIN} --resume --steps 3", "out/run", None),
 }
@@ -112,8 +124,14 @@ class KilledCommand:
         yield from self._problems(after)
         self._run_again()
         after = self._state(self.case)
-        if self.replacement.target == "normals":  # the lost report named the earlier files that were to go
-            after = {name: value for name, value in after.items() if name in self.new or value != self.old.get(name)}
+        if (
+            self.replacement.target == "normals"
+        ):  # the lost report named the earlier files that were to go
+            after = {
+                name: value
+                for name, value in after.items()
+                if name in self.new or value != self.old.get(name)
+            }
         if after != self.new:
             yield "the next run ends with other files"
 
@@ -146,14 +164,18 @@ class KilledCommand:
 
     def _problems(self, state: dict[str, bytes]) -> Iterator[str]:
         """Yield what is wrong with the files after a kill."""
-        if self.replacement.folder == "out/set" and b'"complete": false' in state.get("set/manifest.json", b""):
+        if self.replacement.folder == "out/set" and b'"complete": false' in state.get(
+            "set/manifest.json", b""
+        ):
             return  # a pixel set says itself that it is not finished
         for name, value in state.items():
             if value not in (self.old.get(name), self.new.get(name)):
                 yield f"{name} is neither the old file nor the new one"
         if self.replacement.report is None:
             return
-        report = (Path(self.replacement.folder) / self.replacement.report).relative_to("out").as_posix()
+        report = (
+            (Path(self.replacement.folder) / self.replacement.report).relative_to("out").as_posix()
+        )
         wholes = [whole for whole in (self.old, self.new) if whole.get(report) == state.get(report)]
         # A set that is being added to may have files that its manifest does not name yet.
         if report in state and not any(whole.items() <= state.items() for whole in wholes):
@@ -170,19 +192,28 @@ class KilledCommand:
         return time.monotonic() - started
 
     def _state(self, folder: Path) -> dict[str, bytes]:
-        """Return the content of the output by name, without what differs from run to run, such as times and memory."""
+        """Return the content of the output by name, without what differs from run to run, such as
+        times and memory.
+        """
         files = content(folder / "out")
         files.pop("run/metrics.csv", None)
         for name in (name for name in files if name.endswith("checkpoint.safetensors")):
-            end = 8 + int.from_bytes(files[name][:8], "little")  # the seconds change the length of its header
+            # the seconds change the length of its header
+            end = 8 + int.from_bytes(files[name][:8], "little")
             files[name] = files[name][8:end].rstrip() + files[name][end:]
         return {name: _MEASURED.sub(rb"\1", value) for name, value in files.items()}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="kills at random times, beside those at every step")
-    parser.add_argument("--steps", type=int, help="kill at so many of the steps only, evenly chosen")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--kills", type=int, default=200, help="kills at random times, beside those at every step"
+    )
+    parser.add_argument(
+        "--steps", type=int, help="kill at so many of the steps only, evenly chosen"
+    )
     options = parser.parse_args()
     prepare_process()
     rng, failed, kills = random.Random(0), list[str](), 0
@@ -191,14 +222,24 @@ def main() -> int:
             command = KilledCommand(name, Path(work))
             failed += [f"{name}: {problem}" for problem in command.missing_syncs()]
             total = command.count_steps()
-            steps = sorted({int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))})
+            steps = sorted(
+                {
+                    int(step)
+                    for step in np.linspace(0, total - 1, min(total, options.steps or total))
+                }
+            )
             for step in steps:
                 failed += [f"{name}, step {step}: {problem}" for problem in command.kill(step=step)]
             for _ in range(options.kills // len(REPLACEMENTS)):
                 seconds = rng.uniform(0, 1.1 * command.seconds)
-                failed += [f"{name}, {seconds:.3f} s: {problem}" for problem in command.kill(seconds=seconds)]
+                failed += [
+                    f"{name}, {seconds:.3f} s: {problem}"
+                    for problem in command.kill(seconds=seconds)
+                ]
             kills += command.kill_count
-            told = f"{command.kill_count} kills, at {len(steps)} of {total} steps and at random times"
+            told = (
+                f"{command.kill_count} kills, at {len(steps)} of {total} steps and at random times"
+            )
             print(f"{name}: {told}; {command.new_count} ended in the new files", flush=True)
     print(*failed, f"{kills} kills, {len(failed)} failed", sep="\n")
     return bool(failed)

@@ -21,14 +21,18 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.publishing import held_folder
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="POSIX processes, limits and mounts")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="POSIX processes, limits and mounts"
+)
 
 COMMAND = f"{sys.executable} -m splinecli"
 LIGHTS = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
 
 
 def shell(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        ["bash", "-c", script], cwd=folder, capture_output=True, text=True, timeout=120
+    )
 
 
 @pytest.fixture
@@ -42,7 +46,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_kills_of_every_command() -> None:
-    script = [sys.executable, str(Path(__file__).with_name("kill_commands.py")), "--steps", "2", "--kills", "7"]
+    script = [
+        sys.executable,
+        str(Path(__file__).with_name("kill_commands.py")),
+        "--steps",
+        "2",
+        "--kills",
+        "7",
+    ]
     done = subprocess.run(script, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     for command in ("infer", "calibrate", "integrate", "evaluate", "prepare", "info", "train"):
@@ -57,7 +68,8 @@ def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
     infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
     fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
-        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; {fill if disk_kb == 64 else ''}"
+        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept;"
+        f" {fill if disk_kb == 64 else ''}"
         f" {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
@@ -89,14 +101,19 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> None:
-    """One thread decodes an image while another uses the one before: both end, and nothing is left."""
+    """One thread decodes an image while another uses the one before: both end,
+    and nothing is left.
+    """
     command = [*COMMAND.split(), "infer", str(large), "--method", "ls", "-o", str(tmp_path / "out")]
     # A shell that runs the tests in the background may have switched Ctrl-C off.
     process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    # The lock is taken just before the images are read. A few milliseconds earlier, the folders and the lock are made
-    # and removed once, to look for earlier results.
+    # The lock is taken just before the images are read. A few milliseconds earlier, the folders and
+    # the lock are made and removed once, to look for earlier results.
     lock = tmp_path / "out" / large.name / ".lock"
     deadline = time.monotonic() + 60
     while not lock.exists() and time.monotonic() < deadline:
@@ -111,12 +128,18 @@ def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> No
 def test_too_little_memory_for_the_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The images fit, the albedo does not. This is said before the normals are estimated."""
     before = content(folder / "out")
-    monkeypatch.setattr("splinecli.pipeline.infer.results_bytes", lambda *_, maps, **__: 10**15 * ("albedo" in maps))
+    monkeypatch.setattr(
+        "splinecli.pipeline.infer.results_bytes", lambda *_, maps, **__: 10**15 * ("albedo" in maps)
+    )
     options = InferOptions(method="ls", maps=("albedo",), output=str(folder / "out"))
     monkeypatch.setattr(LeastSquares, "estimate", None)
-    with pytest.raises(InputError, match=r"the results of 3600 pixels take 1000000\.0 GB of memory") as caught:
+    with pytest.raises(
+        InputError, match=r"the results of 3600 pixels take 1000000\.0 GB of memory"
+    ) as caught:
         infer_capture(folder / "a", options)
-    assert caught.value.hint == "Mask the object, or use --scale or --crop, or leave out --maps albedo"
+    assert (
+        caught.value.hint == "Mask the object, or use --scale or --crop, or leave out --maps albedo"
+    )
     assert content(folder / "out") == before
 
 
@@ -143,8 +166,12 @@ print(json.dumps(codes))
 
 
 def test_a_limit_on_open_files(folder: Path) -> None:
-    """The command is refused with one message as long as the limit is too low, and the next start finds results."""
-    done = subprocess.run([sys.executable, "-c", LIMITED], cwd=folder, capture_output=True, text=True)
+    """The command is refused with one message as long as the limit is too low, and the next start
+    finds results.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED], cwd=folder, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     first, *codes = json.loads(done.stdout)
     limited, unlimited = codes[::2], codes[1::2]
@@ -152,7 +179,9 @@ def test_a_limit_on_open_files(folder: Path) -> None:
     assert set(unlimited) == {0}, done.stderr
     assert limited[0] in (3, 5)
     assert set(limited) <= {0, 3, 5}, done.stderr
-    messages = [line for line in done.stderr.splitlines() if not line.startswith("splinecli: warning: ")]
+    messages = [
+        line for line in done.stderr.splitlines() if not line.startswith("splinecli: warning: ")
+    ]
     assert len(messages) == sum(code != 0 for code in limited)
     assert "Traceback" not in done.stderr
     assert {"normals.npy", "normals.png", "report.json"} == set(content(folder / "out" / "a"))
@@ -176,13 +205,17 @@ def test_two_writers_of_one_folder(folder: Path) -> None:
     """One may be refused; what is left is whole."""
     infer = [*COMMAND.split(), "infer", "a", "--method", "ls", "--overwrite", "-q", "--format"]
     commands = [
-        subprocess.Popen([*infer, form], cwd=folder, stderr=subprocess.PIPE, text=True) for form in ("npy", "tiff")
+        subprocess.Popen([*infer, form], cwd=folder, stderr=subprocess.PIPE, text=True)
+        for form in ("npy", "tiff")
     ]
     ended = [(command.communicate(timeout=120)[1], command.returncode) for command in commands]
     assert any(code == 0 for _, code in ended)
     for message, code in ended:
         assert (code, message) in ((0, message), (5, BUSY))
-    assert set(content(folder / "out" / "a")) in ({"normals.npy", "report.json"}, {"normals.tiff", "report.json"})
+    assert set(content(folder / "out" / "a")) in (
+        {"normals.npy", "report.json"},
+        {"normals.tiff", "report.json"},
+    )
 
 
 def test_an_output_folder_without_permission(folder: Path) -> None:

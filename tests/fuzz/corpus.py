@@ -14,7 +14,9 @@ from PIL import Image, ImageCms
 from scipy.io import savemat
 
 SHAPE = (16, 18)
-LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1), (0.4, 0.4, 1)], float)
+LIGHTS = np.array(
+    [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1), (0.4, 0.4, 1)], float
+)
 LIGHTS /= np.linalg.norm(LIGHTS, axis=1, keepdims=True)
 OUT = "out"
 """The folder that commands write into. An earlier run has filled it."""
@@ -28,7 +30,9 @@ class Target:
     write: Callable[[Path], None]  # writes its files into an empty folder
     files: tuple[str, ...]  # patterns of the files that are mutated
     commands: tuple[str, ...]  # the arguments of each command that reads them
-    earlier: tuple[str, ...] = ()  # the commands whose output is there before; the first of `commands` if there is none
+    earlier: tuple[
+        str, ...
+    ] = ()  # the commands whose output is there before; the first of `commands` if there is none
     grows: bool = False  # whether a command that fails late has already added to the earlier output
 
 
@@ -51,7 +55,9 @@ def png_capture(folder: Path) -> None:
     (folder / "filenames.txt").write_text("\n".join(names) + "\n")
     np.savetxt(folder / "light_directions.txt", LIGHTS)
     np.savetxt(folder / "light_intensities.txt", np.ones((len(LIGHTS), 3)))
-    cv2.imwrite(str(folder / "mask.png"), (np.indices(SHAPE).sum(axis=0) > 3).astype(np.uint8) * 255)
+    cv2.imwrite(
+        str(folder / "mask.png"), (np.indices(SHAPE).sum(axis=0) > 3).astype(np.uint8) * 255
+    )
     cv2.imwrite(str(folder / "ambient.png"), np.full(SHAPE, 20, np.uint16))
     savemat(folder / "Normal_gt.mat", {"Normal_gt": normals()}, do_compression=True)
 
@@ -62,7 +68,9 @@ def jpeg_capture(folder: Path) -> None:
         cv2.imwrite(str(folder / f"{number}.jpg"), np.dstack([gray] * 3))
     lines = [f"C:\\rti\\{n}.jpg {x} {y} {z}" for n, (x, y, z) in enumerate(LIGHTS)]
     (folder / "rti.lp").write_text("\n".join([str(len(LIGHTS)), *lines]))
-    alpha = np.dstack([np.full(SHAPE, 200, np.uint8)] * 3 + [np.tri(*SHAPE, k=8, dtype=np.uint8) * 255])
+    alpha = np.dstack(
+        [np.full(SHAPE, 200, np.uint8)] * 3 + [np.tri(*SHAPE, k=8, dtype=np.uint8) * 255]
+    )
     cv2.imwrite(str(folder / "mask.png"), alpha)
     np.save(folder / "normal_gt.npy", normals().astype(np.float32))
 
@@ -77,9 +85,16 @@ def tiff_capture(folder: Path) -> None:
             cv2.imwrite(str(folder / "4.tif"), value)  # LZW
         else:
             rgb = np.dstack([value] * 3)
-            tifffile.imwrite(folder / f"{number}.tif", rgb, photometric="rgb", compression=compression)
+            tifffile.imwrite(
+                folder / f"{number}.tif", rgb, photometric="rgb", compression=compression
+            )
     lights = [
-        {"viewId": number, "type": "directional", "direction": [x, -y, -z], "intensity": [1.0, 1.0, 1.0]}
+        {
+            "viewId": number,
+            "type": "directional",
+            "direction": [x, -y, -z],
+            "intensity": [1.0, 1.0, 1.0],
+        }
         for number, (x, y, z) in enumerate(LIGHTS)
     ]
     (folder / "lights.json").write_text(json.dumps({"lights": lights}))
@@ -103,12 +118,18 @@ def light_files(folder: Path) -> None:
     for number, light in enumerate(LIGHTS):
         cv2.imwrite(str(folder / f"{number}.png"), shaded(light))
     azimuth = np.degrees(np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0]))
-    np.savetxt(folder / "azel.txt", np.stack((azimuth, np.degrees(np.arcsin(LIGHTS[:, 2]))), axis=1), fmt="%.3f")
+    np.savetxt(
+        folder / "azel.txt",
+        np.stack((azimuth, np.degrees(np.arcsin(LIGHTS[:, 2]))), axis=1),
+        fmt="%.3f",
+    )
     np.save(folder / "vectors.npy", LIGHTS)
     rows = [" ".join(f"{value:.6f}" for value in light) for light in LIGHTS]
     (folder / "utf16.txt").write_text("x y z\n" + "\n".join(rows), "utf-16")
     (folder / "commas.txt").write_text("\n".join(rows).replace(".", ",").replace(" ", ";"))
-    (folder / "named.csv").write_text("\n".join(f"{number}.png;{row}" for number, row in enumerate(rows)))
+    (folder / "named.csv").write_text(
+        "\n".join(f"{number}.png;{row}" for number, row in enumerate(rows))
+    )
     (folder / "list.json").write_text(json.dumps(LIGHTS.tolist()))
     lights = [dict(zip("xyz", light, strict=True)) for light in LIGHTS.tolist()]
     (folder / "rig.dome").write_text(json.dumps({"directions": lights, "positionsSphere": lights}))
@@ -118,7 +139,9 @@ def light_files(folder: Path) -> None:
 
 
 def normal_maps(folder: Path) -> None:
-    cv2.imwrite(str(folder / "n.png"), np.rint((normals()[..., ::-1] + 1) / 2 * 65_535).astype(np.uint16))
+    cv2.imwrite(
+        str(folder / "n.png"), np.rint((normals()[..., ::-1] + 1) / 2 * 65_535).astype(np.uint16)
+    )
     tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
@@ -149,11 +172,15 @@ def mirror_ball(folder: Path) -> None:
     (folder / "gray").mkdir()
     for number, light in enumerate(LIGHTS[:4]):
         half = light + np.array((0, 0, 1))
-        spot = np.exp(-((np.degrees(np.arccos((n @ (half / np.linalg.norm(half))).clip(-1, 1))) / 4) ** 2))
+        spot = np.exp(
+            -((np.degrees(np.arccos((n @ (half / np.linalg.norm(half))).clip(-1, 1))) / 4) ** 2)
+        )
         ball = np.where(inside, 0.02 + 0.9 * spot, 0.2)
         gray = np.where(inside, 0.5 * (n @ light).clip(0), 0)
         for name, picture in (("ball", ball), ("gray", gray)):
-            cv2.imwrite(str(folder / name / f"{number}.png"), np.rint(picture * 65_535).astype(np.uint16))
+            cv2.imwrite(
+                str(folder / name / f"{number}.png"), np.rint(picture * 65_535).astype(np.uint16)
+            )
     for name in ("ball", "gray"):
         cv2.imwrite(str(folder / name / "mask.png"), inside.astype(np.uint8) * 255)
     np.savetxt(folder / "known.txt", LIGHTS[:4])
@@ -172,7 +199,10 @@ def thin(folder: Path) -> None:
 
 def meshes(folder: Path) -> None:
     """A tetrahedron in every format."""
-    corners, faces = (((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)))
+    corners, faces = (
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)),
+    )
     shape = trimesh.Trimesh(corners, faces)
     for ending in ("ply", "obj", "stl", "stl_ascii", "off"):
         shape.export(folder / f"m.{ending}", file_type=ending)
@@ -194,7 +224,9 @@ def weights(folder: Path) -> None:
     from splinecli.estimate.networks.weights import save_weights
 
     torch.manual_seed(0)
-    config = NetworkConfig(map_size=8, width=2, li_blocks=1, ne_blocks=1, head_width=4, fits=("ls",))
+    config = NetworkConfig(
+        map_size=8, width=2, li_blocks=1, ne_blocks=1, head_width=4, fits=("ls",)
+    )
     save_weights(SplineNet(config), folder / "w.safetensors")
     torch.save({"a": torch.zeros(3)}, folder / "g.ckpt")
     torch.save({"a": torch.zeros(3)}, folder / "old.ckpt", _use_new_zipfile_serialization=False)
@@ -216,7 +248,8 @@ def training(folder: Path) -> None:
 
 def write_settings(folder: Path) -> None:
     (folder / "a.toml").write_text(
-        "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule = 'cosine'\nheld_share = 0.0\n"
+        "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule ="
+        " 'cosine'\nheld_share = 0.0\n"
         "[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights = 5\n"
         "[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n"
     )
@@ -229,74 +262,158 @@ def each(command: str, words: str) -> tuple[str, ...]:
 
 TRAIN = "train set -o out/run -q"
 TARGETS = (
-    Target("png", png_capture, ("*",), (
-        "infer . --method ls -o out --overwrite --maps albedo",
-        "info . --plot plots/lights.png --overwrite",
-        "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
-        "prepare . -o out/set",
-    )),
+    Target(
+        "png",
+        png_capture,
+        ("*",),
+        (
+            "infer . --method ls -o out --overwrite --maps albedo",
+            "info . --plot plots/lights.png --overwrite",
+            "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
+            "prepare . -o out/set",
+        ),
+    ),
     Target("jpeg", jpeg_capture, ("*",), ("infer . --method ls -o out --overwrite", "info .")),
-    Target("tiff", tiff_capture, ("*",), (
-        "infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite",
-    )),
-    Target("pgm and stack", pgm_and_stack_captures, ("*/*.pgm", "*/*.tif"), (
-        *each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack",
-    )),
-    Target("lights", light_files, ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"), (
-        *each("infer . --method ls --lights {} -o out --overwrite",
-              "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome"),
-        "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
-        "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
-        " --overwrite",
-    )),
-    Target("normals", normal_maps, ("*",), each(
-        "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite",
-        "n.png n.tif n.npy n.mat packed.mat",
-    )),
+    Target(
+        "tiff",
+        tiff_capture,
+        ("*",),
+        (
+            "infer . --method ls -o out --overwrite",
+            "evaluate . --method ls --draws draws.txt -o out --overwrite",
+        ),
+    ),
+    Target(
+        "pgm and stack",
+        pgm_and_stack_captures,
+        ("*/*.pgm", "*/*.tif"),
+        (
+            *each("infer {} --method ls -o out --overwrite", "pgm stack"),
+            "info stack",
+        ),
+    ),
+    Target(
+        "lights",
+        light_files,
+        ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"),
+        (
+            *each(
+                "infer . --method ls --lights {} -o out --overwrite",
+                "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome",
+            ),
+            "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
+            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix"
+            " camera.txt -o out"
+            " --overwrite",
+        ),
+    ),
+    Target(
+        "normals",
+        normal_maps,
+        ("*",),
+        each(
+            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out"
+            " --overwrite",
+            "n.png n.tif n.npy n.mat packed.mat",
+        ),
+    ),
     Target("thin", thin, ("*/*",), each("infer {} --method ls -o out --overwrite", "column row")),
-    Target("meshes", meshes, ("m.*",), each(
-        "prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}", "ply obj stl stl_ascii off",
-    )),
-    Target("ball", mirror_ball, ("*/*", "known.txt"), (
-        "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
-        "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
-    )),
-    Target("profiles", profiles, ("*/*.*",), tuple(
-        f"{command} {ending}{options}"
-        for ending in ("png", "tif", "jpg")
-        for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
-    )),
-    Target("set", two_captures, ("out/set/*", "out/set/*/*"), (
-        "prepare capture second -o out/set",
-        "prepare capture -o out/set --update",
-        "train out/set -o out/run -q --config a.toml",
-    ), earlier=("prepare capture -o out/set",), grows=True),
-    Target("earlier", two_captures,
-           ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"), (
-        "infer capture --method ls -o out",
-        "infer second --method ls -o out --html --surface",
-        "infer capture --method ls -o out --update",
-        "integrate out/capture -o out/capture --overwrite",
-        "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
-        "prepare capture -o out/set",
-    ), earlier=("evaluate capture --method ls --n-lights 4 --trials 1 -o out", "infer capture --method ls -o out")),
-    Target("weights", weights, ("w.safetensors", "*.ckpt"), (
-        "infer capture --weights w.safetensors -o out --overwrite",
-        *each("import-weights {} g.ckpt -o out/w.safetensors --overwrite", "g.ckpt old.ckpt"),
-    )),
-    Target("training", training, ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"), (
-        f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1",
-    ), earlier=(f"{TRAIN} --config a.toml",)),
-)  # fmt: skip
+    Target(
+        "meshes",
+        meshes,
+        ("m.*",),
+        each(
+            "prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}",
+            "ply obj stl stl_ascii off",
+        ),
+    ),
+    Target(
+        "ball",
+        mirror_ball,
+        ("*/*", "known.txt"),
+        (
+            "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
+            "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
+        ),
+    ),
+    Target(
+        "profiles",
+        profiles,
+        ("*/*.*",),
+        tuple(
+            f"{command} {ending}{options}"
+            for ending in ("png", "tif", "jpg")
+            for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
+        ),
+    ),
+    Target(
+        "set",
+        two_captures,
+        ("out/set/*", "out/set/*/*"),
+        (
+            "prepare capture second -o out/set",
+            "prepare capture -o out/set --update",
+            "train out/set -o out/run -q --config a.toml",
+        ),
+        earlier=("prepare capture -o out/set",),
+        grows=True,
+    ),
+    Target(
+        "earlier",
+        two_captures,
+        (
+            "out/*/*.json",
+            "out/*.json",
+            "out/*.jsonl",
+            "out/*/*.npy",
+            "out/*/*.png",
+            "out/index.html",
+        ),
+        (
+            "infer capture --method ls -o out",
+            "infer second --method ls -o out --html --surface",
+            "infer capture --method ls -o out --update",
+            "integrate out/capture -o out/capture --overwrite",
+            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new"
+            " --figures --overwrite",
+            "prepare capture -o out/set",
+        ),
+        earlier=(
+            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+            "infer capture --method ls -o out",
+        ),
+    ),
+    Target(
+        "weights",
+        weights,
+        ("w.safetensors", "*.ckpt"),
+        (
+            "infer capture --weights w.safetensors -o out --overwrite",
+            *each("import-weights {} g.ckpt -o out/w.safetensors --overwrite", "g.ckpt old.ckpt"),
+        ),
+    ),
+    Target(
+        "training",
+        training,
+        ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
+        (
+            f"{TRAIN} --resume --config a.toml",
+            "train set -o out/new -q --config a.toml --steps 1",
+        ),
+        earlier=(f"{TRAIN} --config a.toml",),
+    ),
+)
 
 
 def write_corpus(
     folder: Path, case: Path, run: Callable[[Path, str], int], names: tuple[str, ...] = ()
 ) -> list[Target]:
-    """Write the files of the targets into folders of their names, each with the output of an earlier run.
+    """Write the files of the targets into folders of their names, each with the output of an
+    earlier run.
 
-    Every command runs once on whole input, which also imports all that it needs. It runs in the folder `case`, where
-    the commands will run, because reports and checkpoints name absolute paths. Without names, all targets are written.
+    Every command runs once on whole input, which also imports all that it needs. It runs in the
+    folder `case`, where the commands will run, because reports and checkpoints name absolute paths.
+    Without names, all targets are written.
     """
     targets = [target for target in TARGETS if not names or target.name in names]
     folder.mkdir()

@@ -1,4 +1,6 @@
-"""Seeded mutations of files: of bytes, of texts and their numbers, of JSON values, of headers, of what a path is."""
+"""Seeded mutations of files: of bytes, of texts and their numbers, of JSON values, of headers, of
+what a path is.
+"""
 
 import io
 import json
@@ -19,23 +21,91 @@ from PIL import Image
 from scipy.io import savemat
 
 ODD_NUMBERS = (
-    "nan", "inf", "-inf", "1e999", "-0", "1e-320", "9" * 400, "9" * 5000, "1_0", "0x10", "١", "--1", "", "-1",
-    "4294967296", "2147483648", "-2147483649", "1e308", "1,5",
-)  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "1e999",
+    "-0",
+    "1e-320",
+    "9" * 400,
+    "9" * 5000,
+    "1_0",
+    "0x10",
+    "١",
+    "--1",
+    "",
+    "-1",
+    "4294967296",
+    "2147483648",
+    "-2147483649",
+    "1e308",
+    "1,5",
+)
 ODD_TEXTS = (
-    "", "\x00", "\x1b[2J", "a\nsplinecli: warning: fake", "../../etc/passwd", "/dev/zero", "𝔘\u202e", "%s", "a" * 5000,
-)  # fmt: skip
+    "",
+    "\x00",
+    "\x1b[2J",
+    "a\nsplinecli: warning: fake",
+    "../../etc/passwd",
+    "/dev/zero",
+    "𝔘\u202e",
+    "%s",
+    "a" * 5000,
+)
 ODD_VALUES: tuple[Any, ...] = (
-    None, True, False, [], {}, "", -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "a\nb", [[[]]], {"a": 1},
-    [1, 2, 3], -(2**63), 2**31,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    [],
+    {},
+    "",
+    -1,
+    0,
+    1.5,
+    10**30,
+    10**400,
+    float("nan"),
+    float("inf"),
+    "a\nb",
+    [[[]]],
+    {"a": 1},
+    [1, 2, 3],
+    -(2**63),
+    2**31,
+)
 ODD_NAMES = (
-    b"a\nsplinecli: warning: fake", b"\x1b[2J\x07", b"a\xff\xfeb", b"-o", b"--method", b"..a", b"...", b" ", b"a b\t",
-    b"=1+1", b"a" * 240, "\u202eb".encode(), "é".encode(), "e\u0301".encode(), b"[a]*?", b"$(touch x)`", b"'\"",
-    b"%s%n", b"$\\frac$", b"<b>", b"~", b"a\\b", b"nul", b"report.json", b"mask", b"light_directions", b"ambient",
-    b".hidden", b"1e999",
-)  # fmt: skip
-"""Names that a terminal, a shell, a spreadsheet or splinecli itself might take for something else."""
+    b"a\nsplinecli: warning: fake",
+    b"\x1b[2J\x07",
+    b"a\xff\xfeb",
+    b"-o",
+    b"--method",
+    b"..a",
+    b"...",
+    b" ",
+    b"a b\t",
+    b"=1+1",
+    b"a" * 240,
+    "\u202eb".encode(),
+    "é".encode(),
+    "e\u0301".encode(),
+    b"[a]*?",
+    b"$(touch x)`",
+    b"'\"",
+    b"%s%n",
+    b"$\\frac$",
+    b"<b>",
+    b"~",
+    b"a\\b",
+    b"nul",
+    b"report.json",
+    b"mask",
+    b"light_directions",
+    b"ambient",
+    b".hidden",
+    b"1e999",
+)
+"""Names that a terminal, a shell, a spreadsheet or splinecli itself might take for something else.
+"""
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _TEXTS = (".txt", ".lp", ".json", ".toml", ".csv", ".jsonl", ".html")
 
@@ -66,7 +136,9 @@ def splice(data: bytes, rng: random.Random) -> bytes:
 def odd_word(data: bytes, rng: random.Random) -> bytes:
     """Write an odd binary number somewhere."""
     form = rng.choice(("<I", ">I", "<H", ">H", "<Q"))
-    word = struct.pack(form, rng.choice((0, 1, 0x7FFF, 0x8000, 0xFFFF)) * (65_537 if form[1] != "H" else 1))
+    word = struct.pack(
+        form, rng.choice((0, 1, 0x7FFF, 0x8000, 0xFFFF)) * (65_537 if form[1] != "H" else 1)
+    )
     place = rng.randrange(max(1, len(data)))
     return data[:place] + word + data[place + len(word) :]
 
@@ -86,7 +158,14 @@ def long(data: bytes, rng: random.Random) -> bytes:
 
 def garbage(data: bytes, rng: random.Random) -> bytes:
     return rng.choice(
-        (b"", b"\0" * 4096, rng.randbytes(300), b"[" * 100_000, b"\xff\xfe" + data, "é\n".encode("utf-16"))
+        (
+            b"",
+            b"\0" * 4096,
+            rng.randbytes(300),
+            b"[" * 100_000,
+            b"\xff\xfe" + data,
+            "é\n".encode("utf-16"),
+        )
     )
 
 
@@ -101,7 +180,11 @@ def number(data: bytes, rng: random.Random) -> bytes:
 def lines(data: bytes, rng: random.Random) -> bytes:
     rows = data.split(b"\n")
     place = rng.randrange(len(rows))
-    changed = [rng.choice(rows), rows[place]], [], [rng.choice(ODD_TEXTS).encode("utf-8", "surrogatepass")]
+    changed = (
+        [rng.choice(rows), rows[place]],
+        [],
+        [rng.choice(ODD_TEXTS).encode("utf-8", "surrogatepass")],
+    )
     rows[place : place + 1] = rng.choice(changed)
     if rng.random() < 0.25:
         rng.shuffle(rows)
@@ -117,7 +200,13 @@ def json_value(data: bytes, rng: random.Random) -> bytes:
     places: list[tuple[Any, Any]] = []
 
     def collect(value: Any) -> None:
-        for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        for key in (
+            value
+            if isinstance(value, dict)
+            else range(len(value))
+            if isinstance(value, list)
+            else ()
+        ):
             places.append((value, key))
             collect(value[key])
 
@@ -139,7 +228,9 @@ def png_header(data: bytes, rng: random.Random) -> bytes:
         return flip_header(data, rng)
     body = bytearray(data[12:29])
     if rng.random() < 0.6:
-        struct.pack_into(">I", body, 4 + 4 * rng.randrange(2), rng.choice((0, 1, 17, 30_000, 2**31 - 1)))
+        struct.pack_into(
+            ">I", body, 4 + 4 * rng.randrange(2), rng.choice((0, 1, 17, 30_000, 2**31 - 1))
+        )
     else:
         body[rng.randrange(12, 17)] = rng.randrange(20)
     return data[:12] + bytes(body) + struct.pack(">I", zlib.crc32(body)) + data[33:]
@@ -147,7 +238,9 @@ def png_header(data: bytes, rng: random.Random) -> bytes:
 
 @cache
 def _bomb(suffix: str) -> bytes:
-    """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, normals of 4000 x 4000, or weights."""
+    """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, normals of 4000 x 4000,
+    or weights.
+    """
     if suffix == ".safetensors":  # many empty tensors
         empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
         header = json.dumps({f"t{number}": empty for number in range(10_000)}).encode()
@@ -160,10 +253,15 @@ def _bomb(suffix: str) -> bytes:
         return packed.getvalue()
     rows = zlib.compress(bytes(8000 * 8001), 1)
     if suffix == ".png":
-        parts = ((b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 0, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b""))
+        parts = (
+            (b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 0, 0, 0, 0)),
+            (b"IDAT", rows),
+            (b"IEND", b""),
+        )
         chunks = (kind + content for kind, content in parts)
         return b"\x89PNG\r\n\x1a\n" + b"".join(
-            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
+            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+            for chunk in chunks
         )
     buffer = io.BytesIO()
     if suffix == ".mat":
@@ -191,8 +289,17 @@ def safetensors_header(data: bytes, rng: random.Random) -> bytes:
 
 
 OF_BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    flip, flip, flip_header, flip_header, cut, splice, odd_word, odd_word, fill, garbage,
-)  # fmt: skip
+    flip,
+    flip,
+    flip_header,
+    flip_header,
+    cut,
+    splice,
+    odd_word,
+    odd_word,
+    fill,
+    garbage,
+)
 
 
 def mat_type(data: bytes, rng: random.Random) -> bytes:
@@ -220,11 +327,34 @@ def npy_header(data: bytes, rng: random.Random) -> bytes:
     header = data[10:end].decode("latin-1")
     if rng.random() < 0.5:
         shape = rng.choice(
-            ("(100000, 100000, 3)", "(-1, 3)", "()", "(0, 0, 3)", "(3,)", "(2, 2, 3, 1)", "(1" + "," * 99 + ")")
+            (
+                "(100000, 100000, 3)",
+                "(-1, 3)",
+                "()",
+                "(0, 0, 3)",
+                "(3,)",
+                "(2, 2, 3, 1)",
+                "(1" + "," * 99 + ")",
+            )
         )
         header = re.sub(r"'shape': \([^)]*\)", f"'shape': {shape}", header)
     else:
-        kind = rng.choice(("|O", "<U9", "<c16", "|b1", ">f2", "<f16", "|V8", "<M8[s]", "|S99999999", "<i8", "<u1", "x"))
+        kind = rng.choice(
+            (
+                "|O",
+                "<U9",
+                "<c16",
+                "|b1",
+                ">f2",
+                "<f16",
+                "|V8",
+                "<M8[s]",
+                "|S99999999",
+                "<i8",
+                "<u1",
+                "x",
+            )
+        )
         header = re.sub(r"'descr': '[^']*'", f"'descr': '{kind}'", header)
     text = header.encode("latin-1")
     return data[:8] + struct.pack("<H", len(text)) + text + data[end:]
@@ -235,7 +365,9 @@ def profile(data: bytes, rng: random.Random) -> bytes:
     try:
         with Image.open(io.BytesIO(data)) as image:
             old, buffer = image.info["icc_profile"], io.BytesIO()
-            change = rng.choice((flip, flip_header, cut, odd_word, odd_word, fill, _tag, _tag, _tag))
+            change = rng.choice(
+                (flip, flip_header, cut, odd_word, odd_word, fill, _tag, _tag, _tag)
+            )
             image.save(buffer, image.format, icc_profile=change(old, rng))
         return buffer.getvalue()
     except Exception:
@@ -250,15 +382,24 @@ def _tag(data: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.7:
         curve = data.find(rng.choice((b"para", b"curv")))
         place = max(curve, 0) + 4 * rng.randrange(9)
-    word = rng.choice((b"para", b"curv", *(struct.pack(">i", n) for n in (0, 1, 3 << 16, 4, -1, -(2**31), 2**31 - 1))))
+    word = rng.choice(
+        (
+            b"para",
+            b"curv",
+            *(struct.pack(">i", n) for n in (0, 1, 3 << 16, 4, -1, -(2**31), 2**31 - 1)),
+        )
+    )
     return data[:place] + word + data[place + 4 :]
 
 
 OF_TEXTS = (number, number, number, lines, lines)
 OF_FORMATS = {
-    ".mat": (mat_type,) * 8, ".json": (json_value,) * 15, ".png": (png_header,) * 4, ".npy": (npy_header,) * 8,
+    ".mat": (mat_type,) * 8,
+    ".json": (json_value,) * 15,
+    ".png": (png_header,) * 4,
+    ".npy": (npy_header,) * 8,
     ".safetensors": (safetensors_header,) * 20,
-}  # fmt: skip
+}
 
 
 def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
@@ -292,13 +433,29 @@ def rename(path: Path, rng: random.Random) -> Path:
 
 def odd_path(name: str, rng: random.Random) -> str:
     """Return another way to write the path of a file or folder in the present folder."""
-    forms = ("{}", "{}", "./{}", ".//{}", "../case/{}", "{}/../{}", "{}/", "{}/.", "nothing/../{}", "-{}", "")
+    forms = (
+        "{}",
+        "{}",
+        "./{}",
+        ".//{}",
+        "../case/{}",
+        "{}/../{}",
+        "{}/",
+        "{}/.",
+        "nothing/../{}",
+        "-{}",
+        "",
+    )
     return rng.choice(forms).format(name, name)
 
 
 def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:
-    """Put something else in the place of a file: a folder, a pipe, a device, another file, or nothing."""
-    kind = rng.choice(("folder", "pipe", "loop", "device", "other file", "nothing", "huge", "unreadable"))
+    """Put something else in the place of a file: a folder, a pipe, a device, another file, or
+    nothing.
+    """
+    kind = rng.choice(
+        ("folder", "pipe", "loop", "device", "other file", "nothing", "huge", "unreadable")
+    )
     existing = [file for file in others if file.is_file()]
     other = rng.choice(existing or [path]).read_bytes()
     path.unlink()

@@ -8,8 +8,8 @@ A case is decided by its seed alone: `--first N --cases 1` repeats case N. It pa
 - it takes less than 10 s of processor time and 1 GB of memory, or 300 MB if it fails;
 - a failure leaves the earlier output as it was, and no run leaves unfinished files or locks.
 
-The cases run one after another in a process that has imported everything, so each takes milliseconds. If one kills the
-process or hangs, it fails, and another process takes the next.
+The cases run one after another in a process that has imported everything, so each takes
+milliseconds. If one kills the process or hangs, it fails, and another process takes the next.
 """
 
 import argparse
@@ -52,7 +52,9 @@ DOCUMENTED = {0, 2, 3, 4, 5}
 
 @dataclass(frozen=True)
 class Ended:
-    """What a process left: exit code (None if a signal ended it), texts, processor time, growth of memory in bytes."""
+    """What a process left: exit code (None if a signal ended it), texts, processor time, growth of
+    memory in bytes.
+    """
 
     code: int | None
     out: str
@@ -79,7 +81,9 @@ class Worker:
         code, seconds, memory = json.loads(reply) if reply else (None, WALL_SECONDS, 0)
         if not (reply and self._left):
             self.end()
-        texts = [(self._folder / name).read_text("utf-8", "replace") for name in ("stdout", "stderr")]
+        texts = [
+            (self._folder / name).read_text("utf-8", "replace") for name in ("stdout", "stderr")
+        ]
         return Ended(code, *texts, seconds, memory)
 
     def end(self) -> None:
@@ -105,7 +109,9 @@ class Worker:
     def _serve(self, requests: int, replies: int) -> None:
         """Run the commands of the requests in this process."""
         warnings.simplefilter("always", RuntimeWarning)
-        resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + ADDRESS_SPACE, resource.RLIM_INFINITY))
+        resource.setrlimit(
+            resource.RLIMIT_AS, (_memory("VmSize") + ADDRESS_SPACE, resource.RLIM_INFINITY)
+        )
         for number, name in ((1, "stdout"), (2, "stderr")):
             os.dup2(os.open(self._folder / name, os.O_RDWR | os.O_CREAT | os.O_APPEND), number)
         for line in os.fdopen(requests):
@@ -114,7 +120,9 @@ class Worker:
             for number in (1, 2):
                 os.ftruncate(number, 0)
             started = time.process_time()
-            resource.setrlimit(resource.RLIMIT_CPU, (int(started) + 3 * CPU_SECONDS, resource.RLIM_INFINITY))
+            resource.setrlimit(
+                resource.RLIMIT_CPU, (int(started) + 3 * CPU_SECONDS, resource.RLIM_INFINITY)
+            )
             Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
             base = _memory("VmRSS")
             code = _run_here(command)
@@ -156,7 +164,9 @@ def run_warm(folder: Path, command: str) -> int:
 
 
 def prepare_process() -> None:
-    """Keep libraries from starting threads, which a forked process would lack, and leave out long work."""
+    """Keep libraries from starting threads, which a forked process would lack, and leave out long
+    work.
+    """
     os.environ["OMP_NUM_THREADS"] = "1"
     import cv2
     import torch
@@ -182,7 +192,11 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
     if any("Warning:" in line and "/trimesh/" not in line for line in ended.err.split("\n")):
         yield "a warning of Python"
     notes = ("splinecli: warning: ", "splinecli: note: ")
-    told = [line for line in ended.err.split("\n") if line.startswith("splinecli: ") and not line.startswith(notes)]
+    told = [
+        line
+        for line in ended.err.split("\n")
+        if line.startswith("splinecli: ") and not line.startswith(notes)
+    ]
     if ended.code and len(told) != 1:
         yield f"{len(told)} messages"
     if any(not (c.isprintable() or c == "\n") for c in ended.out + ended.err):
@@ -207,7 +221,9 @@ def run_case(
     folder = work / "case"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(corpus / target.name, folder)
-    files = sorted(path for pattern in target.files for path in folder.glob(pattern) if path.is_file())
+    files = sorted(
+        path for pattern in target.files for path in folder.glob(pattern) if path.is_file()
+    )
     changed = rng.sample(files, min(len(files), rng.choice((1, 1, 1, 2))))
     others = [path for path in files if path not in changed] or files[:1]
     command = rng.choice(target.commands)
@@ -215,7 +231,9 @@ def run_case(
         folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name != OUT]
         path = rng.choice(folders if folders and rng.random() < 0.5 else files)
         new = rename(path, rng)
-        words = [odd_path(new.name, rng) if word == path.name else word for word in shlex.split(command)]
+        words = [
+            odd_path(new.name, rng) if word == path.name else word for word in shlex.split(command)
+        ]
         did, command = f"{path.name} is now {new.name!r}", shlex.join(words)
     else:
         did = ", ".join(mutate(path, others, rng) for path in changed)
@@ -226,7 +244,9 @@ def run_case(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
@@ -250,7 +270,10 @@ def main() -> int:
             if found:
                 failed += 1
                 last = ended.err.strip().split("\n")[-1][:300]
-                print(f"case {number}: {', '.join(found)}\n  {what}\n  {ended.seconds:.1f} s: {last}", flush=True)
+                print(
+                    f"case {number}: {', '.join(found)}\n  {what}\n  {ended.seconds:.1f} s: {last}",
+                    flush=True,
+                )
     counts = ", ".join(f"{count} x {key}" for key, count in sorted(codes.items()))
     print(f"{done} cases in {time.monotonic() - started:.0f} s, {failed} failed: {counts}")
     return bool(failed)

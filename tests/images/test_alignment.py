@@ -1,4 +1,6 @@
-"""Images that moved between exposures: the scenes are functions of the place, so a moved image is exact."""
+"""Images that moved between exposures: the scenes are functions of the place, so a moved image is
+exact.
+"""
 
 import json
 from collections.abc import Callable, Iterator
@@ -12,7 +14,13 @@ from numpy.typing import NDArray
 from scenes import ring_lights, shade, write_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.images import alignment
-from splinecli.images.alignment import align_images, common_pixels, place_in_whole, reduced, resample
+from splinecli.images.alignment import (
+    align_images,
+    common_pixels,
+    place_in_whole,
+    reduced,
+    resample,
+)
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import fit_scaled_normals
 from splinecli.pipeline.infer import infer_capture
@@ -24,11 +32,17 @@ LIGHTS = np.concatenate((ring_lights(5, 40), ring_lights(3, 20, 0.4)))
 
 
 def scene(x: Floats, y: Floats, textured: bool) -> tuple[Floats, Floats]:
-    """Return normals (..., 3) and albedo at places in pixels: a relief of bumps, on a dome that ends in the dark."""
+    """Return normals (..., 3) and albedo at places in pixels: a relief of bumps, on a dome that
+    ends in the dark.
+    """
     waves = np.random.default_rng(3)
     right, up = np.zeros_like(x), np.zeros_like(x)
     for _ in range(12):
-        angle, length, phase = waves.uniform(0, 2 * np.pi), waves.uniform(16, 40), waves.uniform(0, 2 * np.pi)
+        angle, length, phase = (
+            waves.uniform(0, 2 * np.pi),
+            waves.uniform(16, 40),
+            waves.uniform(0, 2 * np.pi),
+        )
         fx, fy = 2 * np.pi / length * np.array((np.cos(angle), np.sin(angle)))
         slope = 0.2 * np.cos(fx * x + fy * y + phase)
         right, up = right + slope * np.cos(angle), up - slope * np.sin(angle)
@@ -36,14 +50,22 @@ def scene(x: Floats, y: Floats, textured: bool) -> tuple[Floats, Floats]:
     right, up = right + (x - middle) / SIDE, up - (y - middle) / SIDE
     albedo = np.ones_like(x)
     for _ in range(30 if textured else 0):
-        angle, length, phase = waves.uniform(0, 2 * np.pi), waves.uniform(5, 14), waves.uniform(0, 2 * np.pi)
-        albedo += 0.08 * np.cos(2 * np.pi / length * (np.cos(angle) * x + np.sin(angle) * y) + phase)
+        angle, length, phase = (
+            waves.uniform(0, 2 * np.pi),
+            waves.uniform(5, 14),
+            waves.uniform(0, 2 * np.pi),
+        )
+        albedo += 0.08 * np.cos(
+            2 * np.pi / length * (np.cos(angle) * x + np.sin(angle) * y) + phase
+        )
     rim = 1 / (1 + np.exp((np.hypot(x - middle, y - middle) - 0.42 * SIDE) / 0.7))
     return unit(np.stack((right, up, np.ones_like(x)), axis=-1)), albedo * rim
 
 
 def photographs(transforms: Floats, *, textured: bool, gloss: float = 0.0) -> NDArray[np.float32]:
-    """Return the images (F, SIDE, SIDE) of a camera that moved: the reference's pixel p is at transform @ p."""
+    """Return the images (F, SIDE, SIDE) of a camera that moved: the reference's pixel p is at
+    transform @ p.
+    """
     columns, rows = np.meshgrid(np.arange(SIDE, dtype=float), np.arange(SIDE, dtype=float))
     places = np.stack((columns, rows, np.ones_like(rows))).reshape(3, -1)
     images = []
@@ -55,15 +77,25 @@ def photographs(transforms: Floats, *, textured: bool, gloss: float = 0.0) -> ND
 
 
 def motions(pixels: float, kind: str) -> Floats:
-    """Return transforms of which the first is none, and the others move points by about so many pixels."""
-    rng, middle = np.random.default_rng(int(10 * pixels)), np.array([[1, 0, SIDE / 2], [0, 1, SIDE / 2], [0, 0, 1]])
+    """Return transforms of which the first is none, and the others move points by about so many
+    pixels.
+    """
+    rng, middle = (
+        np.random.default_rng(int(10 * pixels)),
+        np.array([[1, 0, SIDE / 2], [0, 1, SIDE / 2], [0, 0, 1]]),
+    )
     found = [np.eye(3)]
     for _ in LIGHTS[1:]:
-        angle, turn, zoom = rng.uniform(0, 2 * np.pi), *rng.uniform(-0.5, 0.5, 2) * 2 * pixels / SIDE
+        angle, turn, zoom = (
+            rng.uniform(0, 2 * np.pi),
+            *rng.uniform(-0.5, 0.5, 2) * 2 * pixels / SIDE,
+        )
         move = np.eye(3)
         move[:2, 2] = pixels * np.array((np.cos(angle), np.sin(angle)))
         if kind != "translation":
-            move[:2, :2] = (1 + zoom) * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            move[:2, :2] = (1 + zoom) * np.array(
+                [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+            )
         if kind == "homography":
             move[2, :2] = rng.uniform(-1, 1, 2) * pixels / SIDE**2
         found.append(middle @ move @ np.linalg.inv(middle))
@@ -83,7 +115,9 @@ def residuals(found: Floats, true: Floats) -> Floats:
 
 @pytest.mark.parametrize("lights", [LIGHTS, None], ids=["lights", "unknown-lights"])
 @pytest.mark.parametrize("pixels", [0.3, 2.0, 20.0])
-def test_the_motion_of_a_textured_object_is_found_to_a_tenth_of_a_pixel(pixels: float, lights: Floats | None) -> None:
+def test_the_motion_of_a_textured_object_is_found_to_a_tenth_of_a_pixel(
+    pixels: float, lights: Floats | None
+) -> None:
     true = motions(pixels, "translation")
     found = align_images(photographs(true, textured=True), MASK, lights)
     assert residuals(found.transforms, true).max() < 0.1
@@ -114,10 +148,16 @@ def test_aligned_images_give_the_normals_of_unmoved_ones() -> None:
     true = motions(5.0, "similarity")
     still, moved = (photographs(each, textured=True) for each in (motions(0, "translation"), true))
     found = align_images(moved, MASK, LIGHTS).transforms
-    back = np.stack([resample(i[..., None], i[..., None], t)[1][..., 0] for i, t in zip(moved, found, strict=True)])
+    back = np.stack(
+        [
+            resample(i[..., None], i[..., None], t)[1][..., 0]
+            for i, t in zip(moved, found, strict=True)
+        ]
+    )
     inner = MASK & common_pixels(found, MASK.shape)
     one, other = (
-        fit_scaled_normals(images[:, inner].T, np.ones((inner.sum(), len(LIGHTS))), LIGHTS) for images in (still, back)
+        fit_scaled_normals(images[:, inner].T, np.ones((inner.sum(), len(LIGHTS))), LIGHTS)
+        for images in (still, back)
     )
     assert angle_between_deg(unit(one), unit(other)).mean() < 0.3
 
@@ -132,7 +172,9 @@ def test_aligned_images_give_the_normals_of_unmoved_ones() -> None:
     ids=["upside-down", "another-object", "another-object-of-its-shape"],
 )
 @pytest.mark.parametrize("textured", [True, False])
-def test_an_image_that_fits_nowhere_is_named(spoil: Callable[[Floats], Floats], textured: bool) -> None:
+def test_an_image_that_fits_nowhere_is_named(
+    spoil: Callable[[Floats], Floats], textured: bool
+) -> None:
     images = photographs(motions(2.0, "translation"), textured=textured, gloss=0.3)
     images[3] = spoil(images[3])
     assert align_images(images, MASK, LIGHTS).unexplained == 3
@@ -166,27 +208,38 @@ def write_moved(tmp_path: Path) -> Iterator[Callable[..., Path]]:
 
 
 def infer(folder: Path, tmp_path: Path, **options: Any) -> dict[str, Any]:
-    return infer_capture(folder, InferOptions(align=True, method="ls", output=str(tmp_path / "out"), **options))
+    return infer_capture(
+        folder, InferOptions(align=True, method="ls", output=str(tmp_path / "out"), **options)
+    )
 
 
 def test_infer_aligns_and_reports(write_moved: Callable[..., Path], tmp_path: Path) -> None:
     report = infer(write_moved(), tmp_path)
     written = json.loads((tmp_path / "out/moved/report.json").read_text())
     assert written["alignment"]["reference"] == "000.png"
-    assert residuals(np.array(written["alignment"]["transforms"]), motions(3.0, "translation")).max() < 0.1
+    assert (
+        residuals(np.array(written["alignment"]["transforms"]), motions(3.0, "translation")).max()
+        < 0.1
+    )
     codes = [warning["code"] for warning in report["warnings"]]
     assert "images_aligned" in codes and "images_shifted" not in codes
-    part = infer(write_moved(), tmp_path / "part", crop="10,10,100,100", light_indices=(1, 2, 3, 4, 5))
+    part = infer(
+        write_moved(), tmp_path / "part", crop="10,10,100,100", light_indices=(1, 2, 3, 4, 5)
+    )
     assert part["alignment"]["reference"] == "001.png" and len(part["alignment"]["transforms"]) == 5
 
 
-def test_unmoved_images_are_no_reason_to_warn(write_moved: Callable[..., Path], tmp_path: Path) -> None:
+def test_unmoved_images_are_no_reason_to_warn(
+    write_moved: Callable[..., Path], tmp_path: Path
+) -> None:
     report = infer(write_moved(pixels=0.0), tmp_path)
     assert "images_aligned" not in [warning["code"] for warning in report["warnings"]]
     assert max(report["alignment"]["moved_pixels"]) < 0.1
 
 
-def test_captures_that_cannot_be_aligned_are_refused(write_moved: Callable[..., Path], tmp_path: Path) -> None:
+def test_captures_that_cannot_be_aligned_are_refused(
+    write_moved: Callable[..., Path], tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=r"cannot match 002\.png"):
         infer(write_moved(spoilt=True), tmp_path)
     for options in ({"light_indices": (0, 1, 2, 3)}, {"n_lights": 4}):

@@ -1,4 +1,6 @@
-"""White levels and saturated observations, against analytic images; and the object, found by its brightness."""
+"""White levels and saturated observations, against analytic images; and the object, found by its
+brightness.
+"""
 
 import struct
 from pathlib import Path
@@ -13,7 +15,13 @@ from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import open_capture
 from splinecli.errors import InputError
-from splinecli.images.saturation import Saturation, find_object, find_saturated, look_at, restore_saturated
+from splinecli.images.saturation import (
+    Saturation,
+    find_object,
+    find_saturated,
+    look_at,
+    restore_saturated,
+)
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records.white_level import WhiteLevel
 
@@ -24,7 +32,9 @@ FULL_SCALE = WhiteLevel(65_535, "full scale")
 
 
 def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1; its normals."""
+    """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1;
+    its normals.
+    """
     normals, rng = sphere_cap(SIDE), np.random.default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE)) if noise else 1.0
     images = albedo * np.moveaxis(shade(normals, LIGHTS), 2, 0)
@@ -35,9 +45,13 @@ def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDAr
     return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
 
 
-def find(images: Images, *, given: int | None = None, stated: int | None = None) -> tuple[WhiteLevel | None, int]:
+def find(
+    images: Images, *, given: int | None = None, stated: int | None = None
+) -> tuple[WhiteLevel | None, int]:
     """The white level of images (F, H, W), and the number of their saturated observations."""
-    found = tuple(look_at(image.reshape(-1, 1), Path("0.png"), given=given, stated=stated) for image in images)
+    found = tuple(
+        look_at(image.reshape(-1, 1), Path("0.png"), given=given, stated=stated) for image in images
+    )
     saturation = Saturation(images[0].size, found, given)
     number = 0 if saturation.flags is None else int(saturation.flags.sum())
     assert number == saturation.n_saturated.sum()
@@ -73,7 +87,9 @@ def posterised(levels: int, step: int) -> NDArray[np.uint16]:
 
 
 def ring_over_a_plane() -> NDArray[np.uint16]:
-    """Without noise: a flat patch that is equally bright under all lights of a ring, on a darker textured plane."""
+    """Without noise: a flat patch that is equally bright under all lights of a ring, on a darker
+    textured plane.
+    """
     texture = np.random.default_rng(0).uniform(0.2, 0.99, (SIDE, SIDE))
     texture[10:40, 10:40] = 1
     return np.repeat(np.rint(texture * 30_000)[None], 12, axis=0).astype(np.uint16)
@@ -141,9 +157,14 @@ def test_levels_that_the_files_state(stored: int) -> None:
 def test_a_given_level_is_used_as_it_is() -> None:
     images = clip(sphere()[0], 4095)
     assert find(images, given=4000) == (WhiteLevel(4000, "given"), np.count_nonzero(images >= 4000))
-    assert find(images / 4095, given=1) == (WhiteLevel(1, "given"), np.count_nonzero(images == 4095))
+    assert find(images / 4095, given=1) == (
+        WhiteLevel(1, "given"),
+        np.count_nonzero(images == 4095),
+    )
     assert find(images / 4095) == (None, 0)
-    with pytest.raises(InputError, match=r"0\.png: the white level is 4095, but 8-bit pixels end at 255\. Lower"):
+    with pytest.raises(
+        InputError, match=r"0\.png: the white level is 4095, but 8-bit pixels end at 255\. Lower"
+    ):
         find(images.astype(np.uint8), given=4095)
 
 
@@ -172,7 +193,9 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
     assert ls_error_deg(folder, normals, white_level=4095) == found
 
 
-@pytest.mark.parametrize(("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)])
+@pytest.mark.parametrize(
+    ("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)]
+)
 def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int | None) -> None:
     images = bright(100)
     images[0, 0, 0] = 4095  # one pixel alone would not tell
@@ -181,13 +204,17 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
     folder = write_capture(tmp_path / "vase", images, LIGHTS)
     for path in folder.glob("*.png"):
         path.write_bytes(with_chunk(path.read_bytes(), b"sBIT", bytes(bits)))
-    assert open_capture(folder).read().white_level == (WhiteLevel(level, "file") if level else FULL_SCALE)
-    (folder / "011.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())  # not all of them
+    assert open_capture(folder).read().white_level == (
+        WhiteLevel(level, "file") if level else FULL_SCALE
+    )
+    # not all of them
+    (folder / "011.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())
     assert open_capture(folder).read().white_level == FULL_SCALE
 
 
 @pytest.mark.parametrize(
-    ("tag", "value", "level"), [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)]
+    ("tag", "value", "level"),
+    [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
 )
 def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int | None) -> None:
     folder = tmp_path / "vase"
@@ -195,17 +222,30 @@ def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int 
     for number, image in enumerate(bright(100)):
         tifffile.imwrite(folder / f"{number}.tif", image, extratags=[(tag, "H", 1, value, True)])
     np.savetxt(folder / "lights.txt", LIGHTS)
-    assert open_capture(folder).read().white_level == (WhiteLevel(level, "file") if level else FULL_SCALE)
+    assert open_capture(folder).read().white_level == (
+        WhiteLevel(level, "file") if level else FULL_SCALE
+    )
 
 
 def write_12_bit_tiff(path: Path, image: NDArray[np.uint16]) -> None:
     """A TIFF of 12 bits a sample, by its specification."""
     bits = "".join(f"{value:012b}" for value in image.ravel())
     data = int(bits, 2).to_bytes(len(bits) // 8, "big")
-    tags = [(256, image.shape[1]), (257, image.shape[0]), (258, 12), (259, 1), (262, 1), (273, 8), (277, 1)]
+    tags = [
+        (256, image.shape[1]),
+        (257, image.shape[0]),
+        (258, 12),
+        (259, 1),
+        (262, 1),
+        (273, 8),
+        (277, 1),
+    ]
     tags += [(278, image.shape[0]), (279, len(data))]
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
-    header, table = b"II*\0" + struct.pack("<I", 8 + len(data)), struct.pack("<H", len(tags)) + entries + bytes(4)
+    header, table = (
+        b"II*\0" + struct.pack("<I", 8 + len(data)),
+        struct.pack("<H", len(tags)) + entries + bytes(4),
+    )
     path.write_bytes(header + data + table)
 
 
@@ -233,7 +273,9 @@ def matte(pixels: int) -> np.ndarray:
 
 
 def clipped_at(level: float) -> tuple[np.ndarray, ...]:
-    """500 matte pixels: true, which of their observations are saturated, and all as stored and as restored."""
+    """500 matte pixels: true, which of their observations are saturated, and all as stored and as
+    restored.
+    """
     truth = matte(500)
     stored = np.minimum(truth, level).astype(np.float32)
     restored = stored.copy()
@@ -294,7 +336,8 @@ def test_the_largest_part_with_its_holes_filled():
 
 
 @pytest.mark.parametrize(
-    ("brightness", "said"), [(np.zeros((WIDTH, WIDTH)), "are black"), (np.full((WIDTH, WIDTH), 0.5), "covers 100.0 %")]
+    ("brightness", "said"),
+    [(np.zeros((WIDTH, WIDTH)), "are black"), (np.full((WIDTH, WIDTH), 0.5), "covers 100.0 %")],
 )
 def test_nothing_stands_out(brightness, said):
     with pytest.raises(InputError, match=said):
@@ -302,7 +345,14 @@ def test_nothing_stands_out(brightness, said):
 
 
 @pytest.mark.parametrize(
-    "place", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse", "synth/L17/bowl_S"]
+    "place",
+    [
+        "DiLiGenT/pmsData/ballPNG",
+        "DiLiGenT/pmsData/catPNG",
+        "uw/gray",
+        "uw/horse",
+        "synth/L17/bowl_S",
+    ],
 )
 def test_real_objects(shared_data, place):
     """Intersection over union with the masks that people drew."""

@@ -1,4 +1,6 @@
-"""Colours and intensities of lamps that are estimated from images, against scenes where they are known."""
+"""Colours and intensities of lamps that are estimated from images, against scenes where they are
+known.
+"""
 
 import re
 
@@ -16,21 +18,35 @@ from splinecli.maths.robust import fit_scaled_normals
 from splinecli.results.map_values import albedo_map
 
 LIGHTS = spiral_lights(10, 50, 15)
-SOFT = np.tile([(1.5, 0.8, 0.7), (0.7, 1.5, 0.8), (0.8, 0.7, 1.5), (1, 1, 1), (1.3, 1.3, 0.4)], (2, 1))
+SOFT = np.tile(
+    [(1.5, 0.8, 0.7), (0.7, 1.5, 0.8), (0.8, 0.7, 1.5), (1, 1, 1), (1.3, 1.3, 0.4)], (2, 1)
+)
 PURE = np.tile([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (1, 1, 0)], (2, 1)).astype(float)
 
 
-def striped(colours: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return 16-bit images (F, H, W, 3) of a ball with stripes, its normals (H, W, 3) and its mask."""
+def striped(
+    colours: NDArray[np.float64],
+) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return 16-bit images (F, H, W, 3) of a ball with stripes, its normals (H, W,
+    3) and its mask.
+    """
     normals, mask = sphere(48, 0.9)
-    stripes = np.array([(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.2, 0.3, 0.9), (0.7, 0.7, 0.7)])[np.arange(48) // 4 % 4]
+    stripes = np.array([(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.2, 0.3, 0.9), (0.7, 0.7, 0.7)])[
+        np.arange(48) // 4 % 4
+    ]
     shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
     images = np.einsum("hwf,wc,fc->fhwc", shaded, stripes, colours)
     noise = np.random.default_rng(0).normal(0, 0.002, images.shape)
-    return np.rint((images / images.max() + noise).clip(0, 1) * 60_000).astype(np.uint16), normals, mask
+    return (
+        np.rint((images / images.max() + noise).clip(0, 1) * 60_000).astype(np.uint16),
+        normals,
+        mask,
+    )
 
 
-def error_deg(observations: NDArray[np.float32], normals: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
+def error_deg(
+    observations: NDArray[np.float32], normals: NDArray[np.float64], mask: NDArray[np.bool_]
+) -> float:
     lit = observations.min(axis=1) > 0.02
     fitted = unit(fit_scaled_normals(observations[lit], np.ones_like(observations[lit]), LIGHTS))
     return float(angle_between_deg(fitted, normals[mask][lit]).mean())
@@ -41,14 +57,22 @@ def test_colours_are_divided_out(tmp_path) -> None:
     folder = write_capture(tmp_path, images, LIGHTS, mask=mask, intensities=np.ones((10, 3)))
     source = open_capture(folder)
     capture = source.read()
-    for untouched in (source.read(as_stored=True), open_capture(folder, intensities="equal").read()):
+    for untouched in (
+        source.read(as_stored=True),
+        open_capture(folder, intensities="equal").read(),
+    ):
         assert untouched.estimated_colours is None
         assert "estimated_colours" not in [warning.code for warning in untouched.warnings]
     assert "estimated_colours" in [warning.code for warning in capture.warnings]
     ratios = capture.estimated_colours / SOFT
     np.testing.assert_allclose(ratios / ratios.mean(axis=0), np.ones((10, 3)), atol=0.1)
     plain = images[:, mask].mean(axis=2).T.astype(np.float32)
-    assert error_deg(capture.observations, normals, mask) < 2 < 5 < error_deg(plain / plain.max(), normals, mask)
+    assert (
+        error_deg(capture.observations, normals, mask)
+        < 2
+        < 5
+        < error_deg(plain / plain.max(), normals, mask)
+    )
     # Lamps of any colour give the same object the same colours.
     normal_map = np.where(mask[..., None], normals, 0).astype(np.float32)
     albedo = albedo_map(source, capture, normal_map)[mask]
@@ -61,7 +85,9 @@ def test_colours_are_divided_out(tmp_path) -> None:
 
 def test_pure_colours_are_named() -> None:
     images, _, mask = striped(PURE)
-    codes = {warning.code: warning for warning in capture_from_arrays(images, LIGHTS, mask).warnings}
+    codes = {
+        warning.code: warning for warning in capture_from_arrays(images, LIGHTS, mask).warnings
+    }
     assert "light_colours" in codes and codes["light_colours"].error_deg
 
 
@@ -70,7 +96,9 @@ def test_a_gray_object_needs_no_colours() -> None:
     shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
     images = np.rint(np.einsum("hwf,fc->fhwc", shaded, PURE) * 40_000).astype(np.uint16)
     capture = capture_from_arrays(images, LIGHTS, mask, light_intensities=np.ones(10))
-    assert not {"light_colours", "estimated_colours"} & {warning.code for warning in capture.warnings}
+    assert not {"light_colours", "estimated_colours"} & {
+        warning.code for warning in capture.warnings
+    }
 
 
 @pytest.mark.parametrize("change", [0.0, 0.03])
@@ -86,11 +114,15 @@ INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
 def lights(count: int) -> np.ndarray:
     azimuth = np.arange(count) * 2.4
     radius = 0.3 + 0.5 * np.arange(count) / count
-    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
+    return np.stack(
+        (radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1
+    )
 
 
 def textured_sphere(directions: np.ndarray, *, shine: float = 0.0) -> np.ndarray:
-    """Observations (P, F) of a sphere with attached shadows, random albedo, noise, and highlights if any."""
+    """Observations (P, F) of a sphere with attached shadows, random albedo, noise, and highlights
+    if any.
+    """
     rng = np.random.default_rng(5)
     axis = np.linspace(-0.95, 0.95, 50)
     x, y = (values.ravel() for values in np.meshgrid(axis, axis))
@@ -116,7 +148,9 @@ def test_unequal_lights_are_estimated(n_lights, shine):
 def test_equal_lights_are_left_alone(shine):
     directions = lights(8)
     assert (
-        estimate_light_intensities(textured_sphere(directions, shine=shine).astype(np.float32), None, directions)
+        estimate_light_intensities(
+            textured_sphere(directions, shine=shine).astype(np.float32), None, directions
+        )
         is None
     )
 
@@ -124,7 +158,12 @@ def test_equal_lights_are_left_alone(shine):
 def test_scenes_that_do_not_determine_intensities():
     eight = textured_sphere(lights(8)) * INTENSITIES
     never = eight * (np.arange(8) != 3)  # a lamp that did not flash
-    for observations in (textured_sphere(lights(4)) * INTENSITIES[:4], eight[:40], np.zeros((500, 8)), never):
+    for observations in (
+        textured_sphere(lights(4)) * INTENSITIES[:4],
+        eight[:40],
+        np.zeros((500, 8)),
+        never,
+    ):
         directions = lights(observations.shape[1])
         assert estimate_light_intensities(observations.astype(np.float32), None, directions) is None
 
@@ -132,7 +171,9 @@ def test_scenes_that_do_not_determine_intensities():
 @pytest.mark.parametrize("widths", [None, 3.0])
 @pytest.mark.parametrize("tilt", [0.0, 0.05])
 def test_flat_objects(widths, tilt):
-    """A relief whose slopes are around one tenth: with estimated intensities, normals are right but for the tilt."""
+    """A relief whose slopes are around one tenth: with estimated intensities, normals are right but
+    for the tilt.
+    """
     rng, size, directions = np.random.default_rng(1), 40, lights(8)
     y, x = np.mgrid[1 : -1 : size * 1j, -1 : 1 : size * 1j]
     slopes = (0.1 * np.cos(7 * x + 2 * y) + tilt, 0.1 * np.sin(6 * y))
@@ -140,7 +181,9 @@ def test_flat_objects(widths, tilt):
     vectors = np.broadcast_to(directions, (size**2, 8, 3))
     if widths is not None:
         lamps = NearLamps.of(directions * widths * size, 1.0, (size, size), equal=True)
-        towards, attenuation = lamps.light_at(lamps.plane_points(*np.divmod(np.arange(size**2), size)))
+        towards, attenuation = lamps.light_at(
+            lamps.plane_points(*np.divmod(np.arange(size**2), size))
+        )
         vectors = towards * attenuation[..., None]
     shaded = np.einsum("pfc,pc->pf", vectors, normals) * rng.uniform(0.3, 1, (size**2, 1))
     observations = (shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape)).astype(np.float32)
@@ -152,7 +195,10 @@ def test_flat_objects(widths, tilt):
 
     # The images leave the tilt open, which 0.05 makes 3 degrees.
     assert error_deg(found) < 3 + 60 * tilt < 0.5 * error_deg(np.ones(8))
-    assert estimate_light_intensities(shaded.astype(np.float32), None, lambda rows: vectors[rows]) is None
+    assert (
+        estimate_light_intensities(shaded.astype(np.float32), None, lambda rows: vectors[rows])
+        is None
+    )
 
 
 def test_saturated_observations_do_not_count():
@@ -171,13 +217,21 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     plain, restored = source.read(as_stored=True), source.read()
     assert plain.estimated_intensities is None
     low, high = INTENSITIES.min() / INTENSITIES.mean(), INTENSITIES.max() / INTENSITIES.mean()
-    (warning,) = (warning for warning in restored.warnings if warning.code == "estimated_intensities")
+    (warning,) = (
+        warning for warning in restored.warnings if warning.code == "estimated_intensities"
+    )
     stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
     assert stated == pytest.approx([low, high], abs=0.02)
-    np.testing.assert_allclose(restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02)
-    np.testing.assert_allclose(restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5)
+    np.testing.assert_allclose(
+        restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02
+    )
+    np.testing.assert_allclose(
+        restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5
+    )
     some = restored.choose_lights([6, 0, 2])
-    np.testing.assert_array_equal(some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]])
+    np.testing.assert_array_equal(
+        some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]]
+    )
     # Given intensities replace estimates.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
     assert open_capture(tmp_path).read().estimated_intensities is None

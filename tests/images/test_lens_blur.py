@@ -1,4 +1,6 @@
-"""The blur of a lens, estimated and removed. The oracles are images of which the blur, or the sharp image, is known."""
+"""The blur of a lens, estimated and removed. The oracles are images of which the blur, or the sharp
+image, is known.
+"""
 
 import cv2
 import numpy as np
@@ -16,18 +18,25 @@ NONE = np.zeros_like(WHOLE)
 
 
 def discs() -> Images:
-    """Eight images (F, H, W) of bright discs in different places before gray, with the true coverage of each pixel."""
+    """Eight images (F, H, W) of bright discs in different places before gray, with the true
+    coverage of each pixel.
+    """
     rng = np.random.default_rng(0)
     images = np.full((8, FINER * SIDE, FINER * SIDE), 0.2, np.float32)
     for image in images:
         for _ in range(12):
-            middle, radius = rng.integers(20, FINER * SIDE - 20, 2).tolist(), int(rng.integers(20, 60))
+            middle, radius = (
+                rng.integers(20, FINER * SIDE - 20, 2).tolist(),
+                int(rng.integers(20, 60)),
+            )
             cv2.circle(image, middle, radius, 0.8, -1)  # type: ignore[call-overload]
     return np.asarray(images.reshape(8, SIDE, FINER, SIDE, FINER).mean(axis=(2, 4)), np.float32)
 
 
 def blurred(images: Images, sigma: float) -> Images:
-    return np.stack([cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image for image in images])
+    return np.stack(
+        [cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image for image in images]
+    )
 
 
 def removed(images: Images) -> tuple[Images, float | None]:
@@ -40,7 +49,9 @@ def removed(images: Images) -> tuple[Images, float | None]:
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_blur_is_found_and_removed(sigma: float, noise: float) -> None:
     sharp = discs()
-    soft = blurred(sharp, sigma) + np.float32(noise) * np.random.default_rng(1).normal(size=sharp.shape)
+    soft = blurred(sharp, sigma) + np.float32(noise) * np.random.default_rng(1).normal(
+        size=sharp.shape
+    )
     found, estimate = removed(soft.astype(np.float32))
     assert estimate == pytest.approx(sigma, abs=0.2)
     before, after = (np.sqrt(np.square(images - sharp).mean()) for images in (soft, found))
@@ -49,7 +60,9 @@ def test_a_blur_is_found_and_removed(sigma: float, noise: float) -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_sharp_images_stay_as_they_are(noise: float) -> None:
-    images = (discs() + noise * np.random.default_rng(1).normal(size=(8, SIDE, SIDE))).astype(np.float32)
+    images = (discs() + noise * np.random.default_rng(1).normal(size=(8, SIDE, SIDE))).astype(
+        np.float32
+    )
     found, estimate = removed(images)
     assert estimate is None
     np.testing.assert_array_equal(found, images)
@@ -58,7 +71,9 @@ def test_sharp_images_stay_as_they_are(noise: float) -> None:
 def test_fine_texture_stays_as_it_is() -> None:
     """Each pixel has an albedo of its own."""
     rng = np.random.default_rng(2)
-    images = (rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1))).astype(np.float32)
+    images = (rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1))).astype(
+        np.float32
+    )
     assert removed(images)[1] is None
 
 
@@ -71,7 +86,9 @@ def test_images_without_edges_stay_as_they_are(gloss: float) -> None:
 
 
 def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
-    """Wiener's transfer function, where power and noise are those of the docstring, and the filter is long enough."""
+    """Wiener's transfer function, where power and noise are those of the docstring, and the filter
+    is long enough.
+    """
     sigma = 0.7
     frequency = np.array([1 / 8, 1 / 4])[:, None]
     squared = np.add.outer(np.square(np.arange(33) / 64), np.square(np.arange(33) / 64))
@@ -84,7 +101,9 @@ def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
 
 
 def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
-    """The observations of a disc are the same from the whole images as from a mask and the pixels around it."""
+    """The observations of a disc are the same from the whole images as from a mask and the pixels
+    around it.
+    """
     images = blurred(discs(), 0.7)
     y, x = np.mgrid[:SIDE, :SIDE] - SIDE // 2
     mask = np.hypot(x, y) < SIDE / 3
@@ -117,4 +136,6 @@ def test_stored_values_stay_as_they_are() -> None:
     assert capture.removed_blur is None
     np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
     sharpened = capture_from_arrays(images, lights, light_intensities=np.ones(8))
-    np.testing.assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)
+    np.testing.assert_allclose(
+        sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4
+    )

@@ -1,4 +1,6 @@
-"""The sample that checks see, and checks of single facts: equal images, crowded lights, unequal intensities."""
+"""The sample that checks see, and checks of single facts: equal images, crowded lights, unequal
+intensities.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from splinecli.judge.summary import CLOSEUP_SIDE, closeup_of, leave_out_backgrou
 
 
 def test_the_same_image_twice() -> None:
-    observations = shade(cap_directions(5000, 60), spiral_lights(10, 50, 12), gloss=0.2, noise=0.004)
+    observations = shade(
+        cap_directions(5000, 60), spiral_lights(10, 50, 12), gloss=0.2, noise=0.004
+    )
     assert repeated_images(observations) == []
     observations[:, 7] = observations[:, 2]
     assert repeated_images(observations) == [(2, 7)]
@@ -21,7 +25,9 @@ def test_the_same_image_twice() -> None:
 def test_the_spread_of_lights() -> None:
     # x and y have a mean square of 1/4, z of 1/2.
     assert light_spread(ring_lights(8, 45))[0] == pytest.approx(0.5)
-    arc = np.array([(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))])
+    arc = np.array(
+        [(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))]
+    )
     assert light_spread(arc)[0] == pytest.approx(0.02, abs=1e-3)
     assert not light_spread(arc)[1]
     cone = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), 1) for a in np.linspace(0, 6, 9)])
@@ -30,12 +36,16 @@ def test_the_spread_of_lights() -> None:
 
 
 def codes(intensities: np.ndarray) -> list[str]:
-    """Return the warnings about a plane with faint bumps and broad gloss under 12 lights of these intensities."""
+    """Return the warnings about a plane with faint bumps and broad gloss under 12 lights of these
+    intensities.
+    """
     rng = np.random.default_rng(0)
     lights = spiral_lights(12, 55, 15)
     normals = np.concatenate((rng.normal(0, 0.3, (900, 2)), np.ones((900, 1))), axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ halfway(lights).T).clip(0) ** 12) * intensities
+    shaded = (
+        0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ halfway(lights).T).clip(0) ** 12
+    ) * intensities
     values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
     capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
     return [warning.code for warning in check_arrays(capture)]
@@ -47,7 +57,9 @@ def test_unequal_intensities_that_cannot_be_estimated_are_named() -> None:
 
 
 def ball_before(background: float, size: int = 80) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return images (F, H, W) of a matte ball before a noisy plane of some brightness, lights and its mask."""
+    """Return images (F, H, W) of a matte ball before a noisy plane of some brightness, lights and
+    its mask.
+    """
     lights = directions_at(np.arange(12) * 2.4, np.arccos(0.8))
     y, x = np.mgrid[2.2 : -2.2 : size * 1j, -2.2 : 2.2 : size * 1j]
     mask = np.hypot(x, y) < 0.97
@@ -63,7 +75,8 @@ def test_a_closeup_is_around_the_median_pixel_of_the_mask():
         mask = rng.uniform(size=(700, 900)) < share * np.linspace(0, 1, 900)
         for part, places in zip(closeup_of(mask), np.nonzero(mask), strict=True):
             assert part.stop - part.start == CLOSEUP_SIDE
-            assert abs(part.start + CLOSEUP_SIDE // 2 - np.median(places)) <= 1  # of an even number, the lower middle
+            # of an even number, the lower middle
+            assert abs(part.start + CLOSEUP_SIDE // 2 - np.median(places)) <= 1
 
 
 def test_a_dark_background_is_left_out():
@@ -74,7 +87,10 @@ def test_a_dark_background_is_left_out():
     assert np.count_nonzero(sample.mask != mask) < 0.05 * mask.sum()
     assert share == pytest.approx(1 - sample.mask.mean())
     np.testing.assert_array_equal(sample.observations, observations[sample.mask.ravel()])
-    for kept in (Sample(observations[mask.ravel()], mask, 1), Sample(observations[:5], everything[:1, :5], 1)):
+    for kept in (
+        Sample(observations[mask.ravel()], mask, 1),
+        Sample(observations[:5], everything[:1, :5], 1),
+    ):
         assert leave_out_background(kept) == (kept, 0.0)
     bright = Sample(ball_before(0.3)[0].reshape(12, -1).T, everything, 1)
     assert leave_out_background(bright) == (bright, 0.0)
@@ -84,6 +100,10 @@ def test_a_dark_background_is_left_out():
 def test_wrong_lights_are_named_without_a_mask(masked):
     images, lights, mask = ball_before(0.01)
     for signs, expected in (((-1, 1, 1), ["light_frame"]), ((1, 1, 1), [])):
-        capture = capture_from_arrays(images, lights * signs, mask if masked else np.ones_like(mask))
-        codes = [warning.code for warning in check_arrays(capture, intensities=np.ones(capture.n_lights))]
+        capture = capture_from_arrays(
+            images, lights * signs, mask if masked else np.ones_like(mask)
+        )
+        codes = [
+            warning.code for warning in check_arrays(capture, intensities=np.ones(capture.n_lights))
+        ]
         assert codes == expected + ([] if masked else ["no_mask"])

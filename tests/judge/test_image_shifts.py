@@ -12,13 +12,19 @@ SIDE, N_LIGHTS = 90, 10
 
 
 def images(*, texture: float, seed: int = 0) -> np.ndarray:
-    """Images (H, W, F) of a matte dome with bumps and a painted pattern, under lights on a ring, with noise."""
+    """Images (H, W, F) of a matte dome with bumps and a painted pattern, under lights on a ring,
+    with noise.
+    """
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[1 : -1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
-    normals = np.stack((0.6 * x + 0.2 * np.sin(17 * y), 0.6 * y + 0.2 * np.cos(13 * x), np.ones_like(x)), axis=-1)
+    normals = np.stack(
+        (0.6 * x + 0.2 * np.sin(17 * y), 0.6 * y + 0.2 * np.cos(13 * x), np.ones_like(x)), axis=-1
+    )
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     albedo = 0.6 + texture * rng.uniform(-1, 1, (SIDE, SIDE))
-    shaded = albedo[..., None] * (normals @ ring_lights(N_LIGHTS, np.degrees(np.arccos(0.8))).T).clip(0)
+    shaded = albedo[..., None] * (
+        normals @ ring_lights(N_LIGHTS, np.degrees(np.arccos(0.8))).T
+    ).clip(0)
     return shaded * (1 + 0.01 * rng.normal(size=shaded.shape)) * rng.uniform(0.5, 2, N_LIGHTS)
 
 

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 SIZE = 64
 SHIFTED = "if image 1 belongs to light 2, image 2 to the next, and so on"
 ring = partial(ring_lights, zenith_deg=40, first_rad=0.3)
-# Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise
+# Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of
+# noise
 shade = partial(scenes.shade, gloss=0.3, noise=0.01)
 
 
@@ -31,12 +32,16 @@ def scattered(count: int = 14) -> Array:
 
 
 def vase() -> tuple[Array, NDArray[np.bool_]]:
-    """The normals (P, 3) of a tilted ellipsoid with a dent, and its mask: z = sqrt(1 - u^2 - 2 v^2) - bump."""
+    """The normals (P, 3) of a tilted ellipsoid with a dent, and its mask: z = sqrt(1 - u^2 - 2 v^2)
+    - bump.
+    """
     y, x = -np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
     x = -x
     u, v = 0.8 * x + 0.5 * y, 1.1 * y - 0.3 * x
     inside = u**2 + 1.6 * v**2 < 0.97
-    z = np.sqrt(np.maximum(1 - u**2 - 1.6 * v**2, 0.03)) - 0.12 * np.exp(-((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05)
+    z = np.sqrt(np.maximum(1 - u**2 - 1.6 * v**2, 0.03)) - 0.12 * np.exp(
+        -((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05
+    )
     z_row, z_x = np.gradient(z, 2 / (SIZE - 1))
     return unit(np.stack((-z_x, z_row, np.ones_like(z)), axis=2))[inside], inside
 
@@ -82,9 +87,14 @@ def test_each_wrong_order_is_named(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("order", "words"),
-    [(np.roll(np.arange(12), 1), SHIFTED), (np.arange(12)[::-1], "in reversed order, beginning with light 12")],
+    [
+        (np.roll(np.arange(12), 1), SHIFTED),
+        (np.arange(12)[::-1], "in reversed order, beginning with light 12"),
+    ],
 )
-def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(order: NDArray[np.int64], words: str) -> None:
+def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(
+    order: NDArray[np.int64], words: str
+) -> None:
     check = check_vase(ring(12), ring(12)[order])
     assert check.order is None, "a turned ring fits as well"
     assert check.best.name == words
@@ -106,7 +116,10 @@ def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
 def metal(normals: Array, lights: Array) -> Array:
     """A highlight, whose brightness varies from image to image, and hardly any matte reflection."""
     lit = np.clip(normals @ lights.T, 0, None)
-    return 0.02 * lit + np.clip(normals @ scenes.halfway(lights).T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
+    return (
+        0.02 * lit
+        + np.clip(normals @ scenes.halfway(lights).T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
+    )
 
 
 @pytest.mark.parametrize("name", ["right", "swapped", "shuffled"])
@@ -117,10 +130,18 @@ def test_the_order_of_metal_is_judged(name: str) -> None:
 
 def test_on_a_flat_relief_only_known_intensities_tell_the_order() -> None:
     y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
-    normals = unit(np.stack((-0.03 * np.cos(3 * x), 0.03 * np.sin(2 * y), np.ones_like(x)), axis=2).reshape(-1, 3))
+    normals = unit(
+        np.stack((-0.03 * np.cos(3 * x), 0.03 * np.sin(2 * y), np.ones_like(x)), axis=2).reshape(
+            -1, 3
+        )
+    )
     mask, lights = np.ones((SIZE, SIZE), np.bool_), scattered()
     observations = shade(normals, lights)
-    for given, known, order in ((lights, True, None), (lights, False, None), (np.roll(lights, 1, 0), True, SHIFTED)):
+    for given, known, order in (
+        (lights, True, None),
+        (lights, False, None),
+        (np.roll(lights, 1, 0), True, SHIFTED),
+    ):
         factors = find_factors(observations, intensities_known=known)
         check = check_lights(observations, mask, given, factors=factors)
         assert check.order == order
@@ -145,7 +166,8 @@ def test_misfits_are_those_of_least_squares() -> None:
 
 
 def test_the_columns_of_an_exchanged_file() -> None:
-    # The file has y before x, and its y points down: (y, x, z) = (0.2, 0.5, 0.8) is x = 0.5, y = -0.2.
+    # The file has y before x, and its y points down: (y, x, z) = (0.2, 0.5, 0.8) is x = 0.5, y =
+    # -0.2.
     frame = parse_light_frame("swap-xy, y-down")
     np.testing.assert_array_equal(np.array((0.2, 0.5, 0.8)) @ frame.matrix.T, (0.5, -0.2, 0.8))
     assert frame.describe() == "x and y exchanged, y negated"
@@ -157,7 +179,9 @@ def test_refused_frames(text: str) -> None:
         parse_light_frame(text)
 
 
-@pytest.mark.parametrize("name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"])
+@pytest.mark.parametrize(
+    "name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"]
+)
 def test_real_captures(shared_data: Path, name: str) -> None:
     chosen = None if "uw" in name else list(range(3, 96, 7))
     capture = read_capture(shared_data / name, light_indices=chosen)
@@ -186,21 +210,31 @@ def test_a_line_of_pixels_tells_no_frame(shape: tuple[int, int]) -> None:
 
 
 def dome(*counts: int) -> Array:
-    """Lights in rings of so many lamps, from low to high, each turned by ten degrees against the one below."""
+    """Lights in rings of so many lamps, from low to high, each turned by ten degrees against the
+    one below.
+    """
     step = 50 / max(len(counts) - 1, 1)
-    rings = (ring_lights(count, 70 - step * place, np.radians(10 * place)) for place, count in enumerate(counts))
+    rings = (
+        ring_lights(count, 70 - step * place, np.radians(10 * place))
+        for place, count in enumerate(counts)
+    )
     return np.concatenate(list(rings))
 
 
 @pytest.mark.parametrize("frame", [(1, 1, 1), (-1, 1, 1)], ids=["in its frame", "x negated"])
 @pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
-def test_rings_that_begin_at_another_lamp(counts: tuple[int, ...], frame: tuple[int, int, int]) -> None:
+def test_rings_that_begin_at_another_lamp(
+    counts: tuple[int, ...], frame: tuple[int, int, int]
+) -> None:
     lights = dome(*counts)
     read_as, ends = lights.copy(), np.cumsum(counts)
     for start, stop in list(zip(ends - counts, ends, strict=True))[1::2]:
         read_as[start:stop] = np.roll(lights[start:stop], 1, axis=0)
     check = check_vase(lights, read_as * frame)
-    assert check.order is not None and f"lights {counts[0] + 1} to {counts[0] + counts[1]}" in check.order
+    assert (
+        check.order is not None
+        and f"lights {counts[0] + 1} to {counts[0] + counts[1]}" in check.order
+    )
     np.testing.assert_allclose(check.mended, lights, atol=1e-6)
 
 

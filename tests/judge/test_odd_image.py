@@ -1,4 +1,6 @@
-"""An image that contradicts the others, or a ground truth that was moved, is found; right ones are not doubted."""
+"""An image that contradicts the others, or a ground truth that was moved, is found; right ones are
+not doubted.
+"""
 
 import numpy as np
 import pytest
@@ -38,7 +40,9 @@ def tilted(direction: Array, degrees: float) -> Array:
     """Return a unit vector at this angle to the direction, nearer to the camera."""
     across = np.array((0.0, 0.0, 1.0)) - direction[2] * direction
     across /= np.linalg.norm(across)
-    return np.asarray(np.cos(np.radians(degrees)) * direction + np.sin(np.radians(degrees)) * across)
+    return np.asarray(
+        np.cos(np.radians(degrees)) * direction + np.sin(np.radians(degrees)) * across
+    )
 
 
 @pytest.mark.parametrize("shine", [0.0, 0.3, 1.0])
@@ -76,7 +80,9 @@ def test_each_fault_of_an_image_is_odd(fault: str, known: bool) -> None:
         lights[ODD] = tilted(lights[ODD], -40)
     observations = shade(normals, lights)
     if fault == "another object":
-        other = unit(np.stack((-0.8 * normals[:, 1], 0.6 * normals[:, 0], np.ones(len(normals))), axis=1))
+        other = unit(
+            np.stack((-0.8 * normals[:, 1], 0.6 * normals[:, 0], np.ones(len(normals))), axis=1)
+        )
         observations[:, ODD] = shade(other, LIGHTS)[:, ODD]
     elif fault == "half in shadow":
         observations[normals[:, 1] > 0.1, ODD] *= 0.2
@@ -87,7 +93,9 @@ def test_each_fault_of_an_image_is_odd(fault: str, known: bool) -> None:
 @pytest.mark.parametrize(("side", "gloss"), [(56, 0.0), (56, 0.2), (320, 0.0)])
 def test_a_shifted_ground_truth(side: int, gloss: float) -> None:
     normals, mask = scenes.sphere(side)
-    sample = sample_observations(scenes.shade(normals[mask], LIGHTS, gloss=gloss, noise=0.003), mask)
+    sample = sample_observations(
+        scenes.shade(normals[mask], LIGHTS, gloss=gloss, noise=0.003), mask
+    )
     truth = np.where(mask[..., None], normals, 0).astype(np.float32)
     assert check_ground_truth(sample, LIGHTS, truth) == []
     by = sample.step * round(3 * side / 56 / sample.step)

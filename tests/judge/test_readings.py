@@ -1,4 +1,6 @@
-"""Encoded values, near lamps, constant light and wrong intensities, found in scenes of known curve, lamps and light."""
+"""Encoded values, near lamps, constant light and wrong intensities, found in scenes of known curve,
+lamps and light.
+"""
 
 import numpy as np
 import pytest
@@ -15,44 +17,70 @@ from splinecli.records.capture_warnings import CaptureWarning
 Array = NDArray[np.float64]
 SIZE = 48
 TWO_RINGS = np.concatenate((ring_lights(6, 55, 0.3), ring_lights(4, 30)))
-LIGHTS = {"two rings": TWO_RINGS, "one ring": ring_lights(8, 45, 0.2), "spiral": spiral_lights(10, 52, 15)}
+LIGHTS = {
+    "two rings": TWO_RINGS,
+    "one ring": ring_lights(8, 45, 0.2),
+    "spiral": spiral_lights(10, 52, 15),
+}
 CODES = {"nonlinearity_suspected", "near_lights_suspected", "constant_light", "unequal_intensities"}
 
 
 def surface(shape: str) -> tuple[Array, NDArray[np.bool_]]:
-    """Return normals (P, 3) and the mask (SIZE, SIZE) of a ball, of bumps over the picture, or of a tilted plate."""
+    """Return normals (P, 3) and the mask (SIZE, SIZE) of a ball, of bumps over the picture, or of a
+    tilted plate.
+    """
     x, y = square_grid(SIZE)
     if shape == "ball":
         normals, mask = ball(SIZE, 0.95)
         return normals[mask], mask
     slopes = {"bumps": (0.5 * np.cos(5 * x) * np.cos(4 * y), -0.4 * np.sin(5 * x) * np.sin(4 * y))}
     across = slopes.get(shape, (0.3 + 0 * x, 0.15 + 0 * x))
-    return unit(np.stack((*across, np.ones_like(x)), axis=2)).reshape(-1, 3), np.ones(x.shape, np.bool_)
+    return unit(np.stack((*across, np.ones_like(x)), axis=2)).reshape(-1, 3), np.ones(
+        x.shape, np.bool_
+    )
 
 
-def values(shape: str, lights: Array, *, gloss: float = 0.0, constant: float = 0.0, noise: float = 0.002) -> Array:
-    """Return observations (P, F), the largest 1, of a surface with a random albedo, also under constant light."""
+def values(
+    shape: str, lights: Array, *, gloss: float = 0.0, constant: float = 0.0, noise: float = 0.002
+) -> Array:
+    """Return observations (P, F), the largest 1, of a surface with a random albedo, also under
+    constant light.
+    """
     normals, _ = surface(shape)
     rng, matte = np.random.default_rng(3), shade(normals, lights)
-    shaded = rng.uniform(0.5, 1, (len(normals), 1)) * (matte + constant) + shade(normals, lights, gloss=gloss) - matte
+    shaded = (
+        rng.uniform(0.5, 1, (len(normals), 1)) * (matte + constant)
+        + shade(normals, lights, gloss=gloss)
+        - matte
+    )
     return np.asarray((shaded / shaded.max() + rng.normal(0, noise, shaded.shape)).clip(0, 1))
 
 
 def encode(linear: Array, bits: int = 16) -> Array:
-    srgb = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
+    srgb = np.where(
+        linear < 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055
+    )
     return np.rint(srgb * (2**bits - 1)) / (2**bits - 1)
 
 
-def found(shape: str, observed: Array, lights: Array, intensities: Array | None = None) -> list[CaptureWarning]:
+def found(
+    shape: str, observed: Array, lights: Array, intensities: Array | None = None
+) -> list[CaptureWarning]:
     if intensities is not None:
         observed = observed / intensities
     mask = surface(shape)[1]
     capture = Capture("scene", observed.astype(np.float32), lights, tuple(range(len(lights))), mask)
-    return [warning for warning in check_arrays(capture, intensities=intensities) if warning.code in CODES]
+    return [
+        warning
+        for warning in check_arrays(capture, intensities=intensities)
+        if warning.code in CODES
+    ]
 
 
 def error_of(observed: Array, lights: Array, shape: str) -> float:
-    """Return the mean error of the brightest pixels' least squares, which is what the wrong reading costs."""
+    """Return the mean error of the brightest pixels' least squares, which is what the wrong reading
+    costs.
+    """
     lit = (observed > 0.02).all(axis=1)
     fitted = unit(np.linalg.lstsq(lights, observed[lit].T, rcond=None)[0].T)
     return float(np.median(angle_between_deg(fitted, surface(shape)[0][lit])))
@@ -75,13 +103,16 @@ def test_encoded_values(shape: str, lights: str, known: bool) -> None:
     (warning,) = found(shape, encode(linear / linear.max()), directions, intensities)
     assert warning.code == "nonlinearity_suspected" and "--transfer srgb" in warning.text
     if not known:
-        assert warning.error_deg == pytest.approx(error_of(encode(linear), directions, shape), rel=0.35)
+        assert warning.error_deg == pytest.approx(
+            error_of(encode(linear), directions, shape), rel=0.35
+        )
 
 
 def test_a_curve_behind_unequal_lamps() -> None:
     intensities = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9, 1.1, 0.6])
     linear = values("bumps", LIGHTS["spiral"]) * intensities
-    assert found("bumps", linear / linear.max(), LIGHTS["spiral"]) == []  # they are estimated, without a fault
+    # they are estimated, without a fault
+    assert found("bumps", linear / linear.max(), LIGHTS["spiral"]) == []
     (warning,) = found("bumps", encode(linear / linear.max()), LIGHTS["spiral"])
     assert warning.code == "nonlinearity_suspected"
 
@@ -90,7 +121,9 @@ def test_a_curve_behind_unequal_lamps() -> None:
 @pytest.mark.parametrize("shape", ["ball", "bumps", "plate"])
 def test_near_lamps(shape: str, widths: float) -> None:
     directions, (normals, mask) = LIGHTS["spiral"], surface(shape)
-    lamps = NearLamps.of(directions * widths * np.ptp(np.flatnonzero(mask.any(axis=0))), 1.0, mask.shape, equal=True)
+    lamps = NearLamps.of(
+        directions * widths * np.ptp(np.flatnonzero(mask.any(axis=0))), 1.0, mask.shape, equal=True
+    )
     towards, attenuations = lamps.light_at(lamps.plane_points(*np.nonzero(mask)))
     shaded = np.einsum("pfc,pc->pf", towards * attenuations[..., None], normals).clip(0)
     (warning,) = found(shape, shaded / shaded.max(), directions)
@@ -100,7 +133,9 @@ def test_near_lamps(shape: str, widths: float) -> None:
     assert stated == pytest.approx(widths, rel=0.26)
 
 
-@pytest.mark.parametrize(("shape", "lights"), [("ball", "spiral"), ("bumps", "two rings"), ("plate", "spiral")])
+@pytest.mark.parametrize(
+    ("shape", "lights"), [("ball", "spiral"), ("bumps", "two rings"), ("plate", "spiral")]
+)
 @pytest.mark.parametrize("share", [0.2, 1.0])
 def test_constant_light(shape: str, lights: str, share: float) -> None:
     (warning,) = found(shape, values(shape, LIGHTS[lights], constant=share), LIGHTS[lights])
@@ -115,7 +150,11 @@ def test_constant_light_under_four_lights() -> None:
 
 @pytest.mark.parametrize(
     ("words", "given"),
-    [("inverted", lambda e: 1 / e), ("in reversed order", lambda e: e[::-1]), ("left out", lambda e: np.ones_like(e))],
+    [
+        ("inverted", lambda e: 1 / e),
+        ("in reversed order", lambda e: e[::-1]),
+        ("left out", lambda e: np.ones_like(e)),
+    ],
 )
 def test_wrong_intensities(words: str, given) -> None:
     intensities = np.array([0.8, 1.0, 1.2, 0.8, 1.1, 0.7, 1.3, 0.9, 1.1, 0.95])
@@ -131,7 +170,11 @@ def test_too_little_is_not_judged() -> None:
     few, black = values("bumps", LIGHTS["spiral"])[:30], np.zeros((400, 10))
     for observed, shape in ((few, (5, 6)), (black, (20, 20))):
         capture = Capture(
-            "few", observed.astype(np.float32), LIGHTS["spiral"], tuple(range(10)), np.ones(shape, np.bool_)
+            "few",
+            observed.astype(np.float32),
+            LIGHTS["spiral"],
+            tuple(range(10)),
+            np.ones(shape, np.bool_),
         )
         assert not CODES & {warning.code for warning in check_arrays(capture)}
 

@@ -11,8 +11,12 @@ SIDE, N_LIGHTS = 56, 12
 LIGHTS = spiral_lights(N_LIGHTS, 60, 15)
 
 
-def images(shape: str, *, gloss: float = 0.0, lights: np.ndarray = LIGHTS) -> tuple[np.ndarray, np.ndarray]:
-    """Images (H, W, F) with black background around a ball, or of a relief that fills the picture; and the mask."""
+def images(
+    shape: str, *, gloss: float = 0.0, lights: np.ndarray = LIGHTS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Images (H, W, F) with black background around a ball, or of a relief that fills the picture;
+    and the mask.
+    """
     if shape == "ball":
         normals, mask = sphere(SIDE)
     else:
@@ -30,7 +34,9 @@ def sample_of(pictures: np.ndarray, mask: np.ndarray) -> Sample:
 def moved(pictures: np.ndarray, shifts: dict[int, tuple[int, int]]) -> np.ndarray:
     pictures = pictures.copy()
     for place, (right, down) in shifts.items():
-        padded = np.pad(pictures[..., place], 8, mode="edge" if pictures[0, 0, place] > 0.1 else "constant")
+        padded = np.pad(
+            pictures[..., place], 8, mode="edge" if pictures[0, 0, place] > 0.1 else "constant"
+        )
         pictures[..., place] = np.roll(padded, (down, right), axis=(0, 1))[8:-8, 8:-8]
     return pictures
 

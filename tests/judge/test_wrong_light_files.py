@@ -1,4 +1,6 @@
-"""Rotated or negated lights, half vectors and wrong rings of a dome are named, mended, and lower the confidence."""
+"""Rotated or negated lights, half vectors and wrong rings of a dome are named, mended, and lower
+the confidence.
+"""
 
 import numpy as np
 import pytest
@@ -27,13 +29,17 @@ def ball() -> tuple[Array, Mask]:
 
 
 def relief(seed: int, sign: int = 1) -> tuple[Array, Mask, Array]:
-    """The normals (P, 3), mask and heights in pixels of steep bumps, or with sign -1 hollows, that fill the picture."""
+    """The normals (P, 3), mask and heights in pixels of steep bumps, or with sign -1 hollows, that
+    fill the picture.
+    """
     rng = np.random.default_rng(seed)
     x, y = square_grid(SIZE)
     z = np.zeros_like(x)
     for place in rng.uniform(-0.9, 0.9, (8, 2)):
         width = rng.uniform(0.12, 0.25)
-        z += sign * 1.6 * width * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 2 / width**2)
+        z += (
+            sign * 1.6 * width * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 2 / width**2)
+        )
     z_down, z_right = np.gradient(z, 2 / (SIZE - 1))
     normals = unit(np.stack((-z_right, z_down, np.ones_like(z)), axis=2))
     return normals.reshape(-1, 3), np.ones((SIZE, SIZE), np.bool_), z * (SIZE - 1) / 2
@@ -63,7 +69,12 @@ def test_right_lights_near_the_axis_are_no_half_vectors(lights: Array) -> None:
     texture = np.random.default_rng(0).uniform(0.5, 1, (SIZE * SIZE, 1))
     for normals, mask, *_ in (ball(), relief(3)):
         seen = shade(normals, high, 0.4)
-        for observations in (seen, seen * texture[: len(seen)], (seen / seen.max()) ** (1 / 2.2), seen + 0.2):
+        for observations in (
+            seen,
+            seen * texture[: len(seen)],
+            (seen / seen.max()) ** (1 / 2.2),
+            seen + 0.2,
+        ):
             assert check_lights(observations, mask, high).order is None
 
 
@@ -97,7 +108,10 @@ def check_relief(sign: int, *, negated: bool, casts: bool) -> LightCheck:
     lights = spiral_lights(14, 72, 30)
     observations = shade(normals, lights)
     if casts:
-        observations = np.where(cast_shadows(heights, lights).reshape(observations.shape), 0.02, 1) * observations
+        observations = (
+            np.where(cast_shadows(heights, lights).reshape(observations.shape), 0.02, 1)
+            * observations
+        )
     return check_lights(observations, mask, lights * ((-1, -1, 1) if negated else (1, 1, 1)))
 
 
@@ -118,7 +132,9 @@ def test_a_step_casts_the_shadow_of_its_height() -> None:
     heights = np.zeros((12, 30))
     heights[:, :10] = 5
     # From the left at 45 degrees, a step of 5 pixels between two pixels shades the next 4.5.
-    cast = cast_shadows(heights, np.array(((-1.0, 0, 1), (1, 0, 1), (0, 0, 1))) / np.sqrt((2, 2, 1))[:, None])
+    cast = cast_shadows(
+        heights, np.array(((-1.0, 0, 1), (1, 0, 1), (0, 0, 1))) / np.sqrt((2, 2, 1))[:, None]
+    )
     assert cast[6, :, 0].nonzero()[0].tolist() == [10, 11, 12, 13]
     assert not cast[..., 1:].any()
 
@@ -133,7 +149,9 @@ def dome(rings: int, per_ring: int, lowest: float, highest: float, jitter: float
     return np.concatenate(lights)
 
 
-@pytest.mark.parametrize("case", [(15, 75, 0.0), (10, 80, 1.0), (30, 48, 0.0), (30, 60, 2.0)], ids=str)
+@pytest.mark.parametrize(
+    "case", [(15, 75, 0.0), (10, 80, 1.0), (30, 48, 0.0), (30, 60, 2.0)], ids=str
+)
 def test_every_second_ring_of_a_dome_with_x_negated(case: tuple[float, float, float]) -> None:
     lights = dome(8, 8, *case)
     given = lights * (-1, 1, 1)
@@ -163,16 +181,22 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_warnings_state_the_error_of_the_normals(fault: str) -> None:
     (normals, mask), (given, code) = ball(), FAULTS[fault]
-    capture = Capture("ball", shade(normals, TWO_RINGS).astype(np.float32), given, np.arange(10), mask)
+    capture = Capture(
+        "ball", shade(normals, TWO_RINGS).astype(np.float32), given, np.arange(10), mask
+    )
     warnings = check_arrays(capture, intensities=np.ones(len(capture.light_directions)))
     stated = [warning.error_deg for warning in warnings if warning.kind == code]
     assert stated and min(error or 0 for error in stated) > 10
 
 
-@pytest.mark.parametrize("kind", [kinds.IMAGE_INCONSISTENT, kinds.REPEATED_IMAGES], ids=["black", "repeated"])
+@pytest.mark.parametrize(
+    "kind", [kinds.IMAGE_INCONSISTENT, kinds.REPEATED_IMAGES], ids=["black", "repeated"]
+)
 def test_a_wrong_image_states_the_error_that_it_makes(kind: kinds.WarningKind) -> None:
     normals, mask = ball()
     observations = shade(normals, TWO_RINGS).astype(np.float32)
     observations[:, 3] = observations[:, 7] if kind == kinds.REPEATED_IMAGES else 0
-    warnings = check_arrays(Capture("ball", observations, TWO_RINGS, np.arange(10), mask), intensities=np.ones(10))
+    warnings = check_arrays(
+        Capture("ball", observations, TWO_RINGS, np.arange(10), mask), intensities=np.ones(10)
+    )
     assert warnings[0].kind == kind and warnings[0].error_deg is not None

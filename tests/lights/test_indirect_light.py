@@ -1,7 +1,8 @@
 """Light from other parts of the object: a spherical bowl, in which it is known exactly.
 
-Two parts of a sphere's inside exchange the same share of light wherever they are. So in a matte bowl of radius R, all
-places receive the same indirect light, sum(B dA) / (4 pi R^2), where B is what the places send.
+Two parts of a sphere's inside exchange the same share of light wherever they are. So in a matte
+bowl of radius R, all places receive the same indirect light, sum(B dA) / (4 pi R^2), where B is
+what the places send.
 """
 
 from dataclasses import replace
@@ -49,7 +50,9 @@ def direct_and_indirect(
     directions: NDArray[np.floating] = LIGHTS,
     strengths: NDArray[np.floating] | float = 1.0,
 ) -> tuple[Floats, Floats]:
-    """Return the light (P, F) that a checkered matte bowl reflects from the lamps, and from itself."""
+    """Return the light (P, F) that a checkered matte bowl reflects from the lamps,
+    and from itself.
+    """
     cosines = (normals[:, None] * directions).sum(-1).clip(0)
     direct = ALBEDO * cosines * strengths
     arriving = (SHARE * direct).sum(axis=0) / (1 - (SHARE * ALBEDO).sum())
@@ -64,7 +67,10 @@ def found_in(
     normals: NDArray[np.floating], observations: Floats, lights: NDArray[np.floating] = LIGHTS
 ) -> IndirectLight | None:
     return find_indirect_light(
-        MASK, observations, lambda rows: PixelLighting(observations[rows], lights), normals.astype(np.float32)
+        MASK,
+        observations,
+        lambda rows: PixelLighting(observations[rows], lights),
+        normals.astype(np.float32),
     )
 
 
@@ -78,12 +84,16 @@ def test_a_bowls_light_on_itself_is_found_at_any_exposure() -> None:
     assert np.abs(left - direct)[INSIDE].mean() < 0.1 * indirect.mean()
 
 
-@pytest.mark.parametrize("camera_matrix", [None, np.array(((200, 0, 31.5), (0, 200, 31.5), (0, 0, 1.0)))])
+@pytest.mark.parametrize(
+    "camera_matrix", [None, np.array(((200, 0, 31.5), (0, 200, 31.5), (0, 0, 1.0)))]
+)
 def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None) -> None:
     points = np.stack((X[MASK], Y[MASK], -BOWL[:, 2]), axis=1)
     points[:, 2] -= points[:, 2].mean()
     distances = np.where(np.arange(10) % 2, 3.0, 2.0)[:, None]
-    lamps = NearLamps.of(distances * LIGHTS, 2 / SIZE, (SIZE, SIZE), equal=False, camera_matrix=camera_matrix)
+    lamps = NearLamps.of(
+        distances * LIGHTS, 2 / SIZE, (SIZE, SIZE), equal=False, camera_matrix=camera_matrix
+    )
     lamps = replace(lamps, points=points.astype(np.float32))
     direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
     seen = direct + indirect
@@ -104,7 +114,9 @@ def test_a_dark_background_changes_nothing() -> None:
     place[320:384, 320:384] = MASK
     normals[place], observations[place] = BOWL, DIRECT + INDIRECT
     normals, observations = normals[mask], observations[mask]
-    found = find_indirect_light(mask, observations, lambda rows: PixelLighting(observations[rows], LIGHTS), normals)
+    found = find_indirect_light(
+        mask, observations, lambda rows: PixelLighting(observations[rows], LIGHTS), normals
+    )
     ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
     assert ratio[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
@@ -121,7 +133,9 @@ def test_ambient_light_is_separated_from_indirect_light() -> None:
 
 
 def test_nothing_is_removed_where_shadows_do_not_show_it() -> None:
-    """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow something else."""
+    """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow
+    something else.
+    """
     assert found_in(BOWL, DIRECT) is None
     noise = np.random.default_rng(0).random(DIRECT.shape, np.float32) / ALBEDO.astype(np.float32)
     assert found_in(BOWL, np.where(DIRECT > 0, DIRECT, INDIRECT * noise)) is None
@@ -149,13 +163,18 @@ def test_the_refinement_sees_what_is_left() -> None:
     with patch.object(NetworkRefiner, "refine") as refine:
         estimate_normals(CAPTURE, make_estimator("spline-net"))
     _, _, lighting_at, *_ = refine.call_args.args
-    assert np.abs(lighting_at(EVERYWHERE).observations - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
+    assert (
+        np.abs(lighting_at(EVERYWHERE).observations - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
+    )
 
 
 def test_the_refinement_net_learns_from_what_it_sees_in_use() -> None:
     estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
     features = pixel_features(
-        estimator.network, torch.from_numpy(CAPTURE.observations), torch.from_numpy(LIGHTS).float(), torch.tensor(MASK)
+        estimator.network,
+        torch.from_numpy(CAPTURE.observations),
+        torch.from_numpy(LIGHTS).float(),
+        torch.tensor(MASK),
     )
     with patch.object(NetworkRefiner, "refine"):
         in_use = estimate_normals(CAPTURE, estimator).normal_map[MASK]

@@ -15,7 +15,9 @@ Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 def rough(lights: NDArray[np.float64], sigma_deg: float, seed: int = 0) -> NDArray[np.float64]:
     """Lights with Gaussian errors across each, whose angle has this root mean square."""
-    errors = np.random.default_rng(seed).normal(scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape)
+    errors = np.random.default_rng(seed).normal(
+        scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape
+    )
     return unit(lights + errors - (errors * lights).sum(axis=1, keepdims=True) * lights)
 
 
@@ -27,14 +29,19 @@ def aligned_error_deg(found: NDArray[np.float64], true: NDArray[np.float64]) -> 
 
 
 @pytest.mark.parametrize("sigma_deg", [4.0, 8.0])
-def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg: float, matte_pixels: Pixels) -> None:
+def test_matte_pixels_determine_lights_up_to_a_rotation(
+    sigma_deg: float, matte_pixels: Pixels
+) -> None:
     _, lights, observations = matte_pixels
     given = rough(lights, sigma_deg)
     found = refine_lights(observations.astype(np.float32), given, error_deg=sigma_deg)
     assert aligned_error_deg(given, lights) > 0.4 * sigma_deg
     assert aligned_error_deg(found.directions, lights) < 0.1
     # The common rotation is that of the mean of 12 errors.
-    assert angle_between_deg(found.directions, lights).mean() < 0.7 * angle_between_deg(given, lights).mean()
+    assert (
+        angle_between_deg(found.directions, lights).mean()
+        < 0.7 * angle_between_deg(given, lights).mean()
+    )
     np.testing.assert_allclose(found.intensities, 1, atol=1e-6)
 
 
@@ -51,15 +58,21 @@ def test_unknown_intensities_are_refined_too(matte_pixels: Pixels) -> None:
     _, lights, observations = matte_pixels
     strengths = np.random.default_rng(3).uniform(0.85, 1.15, 12)
     given = rough(lights, 4.0)
-    found = refine_lights((observations * strengths).astype(np.float32), given, intensities_known=False)
+    found = refine_lights(
+        (observations * strengths).astype(np.float32), given, intensities_known=False
+    )
     relative = found.intensities / strengths
     # Nine common factors are open, which the prior alone holds.
     assert np.std(relative / relative.mean()) < 0.8 * np.std(strengths)
-    assert angle_between_deg(found.directions, lights).mean() < angle_between_deg(given, lights).mean()
+    assert (
+        angle_between_deg(found.directions, lights).mean() < angle_between_deg(given, lights).mean()
+    )
 
 
 def test_exact_lights_stay(glossy_pixels: Pixels) -> None:
-    """Highlights and shadows do not move lights that are right; nothing is taken from too few pixels or lights."""
+    """Highlights and shadows do not move lights that are right; nothing is taken from too few
+    pixels or lights.
+    """
     normals, lights, observations = glossy_pixels
     many = np.tile(observations, (3, 1)).astype(np.float32)
     found = refine_lights(many, lights)
@@ -85,7 +98,9 @@ def test_refinement_is_suggested_for_rough_lights_alone(known: bool, glossy_pixe
 def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
     _, lights, observations = matte_pixels
     given = rough(lights, 4.0)
-    capture = Capture("one", observations.astype(np.float32), given, tuple(range(12)), np.ones((10, 20), bool))
+    capture = Capture(
+        "one", observations.astype(np.float32), given, tuple(range(12)), np.ones((10, 20), bool)
+    )
     refined = refine_capture(capture)
     assert refined.warnings[-1].code == "refined_lights"
     assert not np.array_equal(refined.light_directions, given)
@@ -96,4 +111,13 @@ def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
         refine_capture(capture, error_deg=0.0)
     lamps = NearLamps.of(given, 1.0, (10, 20), equal=True)
     with pytest.raises(UsageError, match="near lamps"):
-        refine_capture(Capture("near", capture.observations, given, capture.light_indices, capture.mask, lamps=lamps))
+        refine_capture(
+            Capture(
+                "near",
+                capture.observations,
+                given,
+                capture.light_indices,
+                capture.mask,
+                lamps=lamps,
+            )
+        )

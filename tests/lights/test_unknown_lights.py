@@ -96,7 +96,11 @@ def test_what_shows_no_object_is_refused() -> None:
     normals, disc = sphere(400)
     ring = disc & ~sphere(400, 0.96)[1]
     for observations, mask, message in (
-        (np.repeat(observed(lights(1)), 6, axis=1) * np.linspace(0.5, 1, 6), INSIDE, "all images are alike"),
+        (
+            np.repeat(observed(lights(1)), 6, axis=1) * np.linspace(0.5, 1, 6),
+            INSIDE,
+            "all images are alike",
+        ),
         (np.zeros((n_pixels, 8)), INSIDE, "all images are alike"),
         (rng.uniform(size=(n_pixels, 8)), INSIDE, "do not show one surface"),
         (shade(normals[ring], lights()), ring, "the mask is too thin"),
@@ -114,14 +118,18 @@ def test_a_first_light_from_another_side_decides_nothing() -> None:
     assert mean_angle(found.directions, true) < 5
 
 
-@pytest.mark.parametrize(("side", "azimuth_deg"), [("upper-right", 45), ("90", 90), ("lower-left", 225), ("-45", 315)])
+@pytest.mark.parametrize(
+    ("side", "azimuth_deg"), [("upper-right", 45), ("90", 90), ("lower-left", 225), ("-45", 315)]
+)
 def test_the_first_light_may_come_from_any_direction(side: str, azimuth_deg: float) -> None:
     true = lights()
     azimuth = np.radians(azimuth_deg)
     true[0] = (0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), 0.8)
     found = find_lights(observed(true), INSIDE, True, first_light=side)
     assert mean_angle(found.directions, true) < 5
-    with pytest.raises(UsageError, match=r"expected one of right, upper-right, .* or its azimuth in degrees"):
+    with pytest.raises(
+        UsageError, match=r"expected one of right, upper-right, .* or its azimuth in degrees"
+    ):
         find_lights(observed(true), INSIDE, True, first_light=side + "x")
 
 
@@ -142,7 +150,11 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow:
     normals = sphere_cap(SIZE).reshape(-1, 3) * ((-1, -1, 1) if hollow else (1, 1, 1))
     images = shade(normals, true, noise=0.002).astype(np.float32)
     with pytest.raises(
-        InputError, match=r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .* --first-light left"
+        InputError,
+        match=(
+            r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .*"
+            r" --first-light left"
+        ),
     ):
         find_lights(images, everywhere, True)
     found = find_lights(images, everywhere, True, first_light="left")
@@ -200,7 +212,9 @@ OPPOSITE = (-1, -1, 1)
 
 
 def cap_on_plate(size: int, lights: Array, *, hollow: bool) -> NDArray[np.float32]:
-    """Return the images (P, F) of half a sphere on a plate, or sunk into it, with attached and cast shadows."""
+    """Return the images (P, F) of half a sphere on a plate, or sunk into it, with attached and cast
+    shadows.
+    """
     radius = 0.6
     x, y = square_grid(size)
     height = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0)) * (-1 if hollow else 1)
@@ -237,7 +251,9 @@ def test_the_outline_tells_a_bump_from_a_hollow() -> None:
 
 
 @pytest.mark.parametrize("hollow", [False, True])
-def test_a_wrong_guess_of_the_network_is_turned_around(hollow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_guess_of_the_network_is_turned_around(
+    hollow: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lights, mask = ring_lights(10, 60), np.ones((64, 64), np.bool_)
     guess = lights * OPPOSITE, np.full(10, 16.0), np.ones(10)
     monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: guess)
@@ -251,7 +267,10 @@ def test_low_lights_are_lowered_until_the_albedo_is_even(raised: float) -> None:
     lights = ring_lights(8, 65)
     images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
     given = unit(lights * (1, 1, raised))
-    before, after = (angle_between_deg(found, lights).mean() for found in (given, lower_lights(images, given, 10.0)))
+    before, after = (
+        angle_between_deg(found, lights).mean()
+        for found in (given, lower_lights(images, given, 10.0))
+    )
     assert after <= max(0.5 * before, 0.5)
 
 

@@ -1,4 +1,6 @@
-"""Materials of spheres shaded by an independent implementation of Lambert's law and GGX, and of a rendered scene."""
+"""Materials of spheres shaded by an independent implementation of Lambert's law and GGX, and of a
+rendered scene.
+"""
 
 import json
 from pathlib import Path
@@ -39,7 +41,9 @@ SURE = np.full(len(NORMALS), 0.999, np.float32)
 
 
 def ggx_sphere(lights, *, diffuse, f0, roughness):
-    """Radiance (P, F) times pi of a Lambertian base under GGX facets (Walter et al., EGSR 2007), without Fresnel."""
+    """Radiance (P, F) times pi of a Lambertian base under GGX facets (Walter et al., EGSR 2007),
+    without Fresnel.
+    """
     alpha = roughness**2
     half = lights + np.array((0, 0, 1.0))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -69,8 +73,10 @@ def test_a_dielectric_sphere(roughness):
     found = material(ggx_sphere(LIGHTS, diffuse=0.5, f0=0.04, roughness=roughness))
     assert abs(np.median(found.roughness) - roughness) < 0.08
     assert found.metalness.max() < 0.1
-    assert np.median(found.specular) == pytest.approx(0.5, rel=0.05)  # by definition of the exposure
-    # With f0 = 0.04, the exposure and the base are absolute, as exact as the reflectance of the facets.
+    # by definition of the exposure
+    assert np.median(found.specular) == pytest.approx(0.5, rel=0.05)
+    # With f0 = 0.04, the exposure and the base are absolute, as exact as the reflectance of the
+    # facets.
     assert found.exposure == pytest.approx(1, abs=0.25)
     assert np.median(found.base_colour) * found.exposure == pytest.approx(0.5, rel=0.05)
     assert np.quantile(np.abs(found.base_colour / np.median(found.base_colour) - 1), 0.8) < 0.1
@@ -89,7 +95,10 @@ def test_paint_in_two_colours_has_one_gloss():
     left = NORMALS[:, 0] < 0
     paint = np.where(left[:, None], (0.6, 0.2, 0.1), (0.1, 0.3, 0.5))
     channels = [ggx_sphere(LIGHTS, diffuse=paint[:, c], f0=0.04, roughness=0.4) for c in range(3)]
-    colours = [np.stack([channel[:, place] for channel in channels], axis=1) for place in range(len(LIGHTS))]
+    colours = [
+        np.stack([channel[:, place] for channel in channels], axis=1)
+        for place in range(len(LIGHTS))
+    ]
     found = material(np.mean(channels, axis=0), colours=colours)
     assert not found.is_gray
     assert np.abs(found.roughness - 0.4).mean() < 0.08
@@ -98,7 +107,9 @@ def test_paint_in_two_colours_has_one_gloss():
 
 
 def test_units_and_order_of_lights():
-    """Seven times the light is seven times the exposure, and nothing else; the order of the lights does not count."""
+    """Seven times the light is seven times the exposure, and nothing else; the order of the lights
+    does not count.
+    """
     observations = ggx_sphere(LIGHTS, diffuse=0.4, f0=0.05, roughness=0.4)
     plain, bright = material(observations), material(7 * observations)
     turned = material(observations[:, ::-1].copy(), LIGHTS[::-1])
@@ -109,12 +120,15 @@ def test_units_and_order_of_lights():
 
 
 def test_generated_pixels_that_training_did_not_use():
-    """The confidence is the probability that the roughness is wrong by at most 0.1. Training used other seeds.
+    """The confidence is the probability that the roughness is wrong by at most 0.1. Training used
+    other seeds.
 
     A constant roughness is wrong by 0.24 on average, and a constant kind right for 65 %.
     """
     network, material_net = material_networks()
-    drawn = PixelGenerator(PixelGeneratorConfig(capture_pixels=64), torch.Generator().manual_seed(8))
+    drawn = PixelGenerator(
+        PixelGeneratorConfig(capture_pixels=64), torch.Generator().manual_seed(8)
+    )
     rows = []
     with torch.inference_mode():
         for _ in range(6):
@@ -126,7 +140,11 @@ def test_generated_pixels_that_training_did_not_use():
             true = batch.truth.material
             wrong = (gloss.roughness - true.roughness[:, 0]).abs()
             is_right = (gloss.metalness > 0.5) == (true.metallic[:, 0] > 0.5)
-            rows.append(torch.stack((wrong, is_right, wrong <= 0.1, 1 - (-0.1 / gloss.roughness_error).exp()), dim=1))
+            rows.append(
+                torch.stack(
+                    (wrong, is_right, wrong <= 0.1, 1 - (-0.1 / gloss.roughness_error).exp()), dim=1
+                )
+            )
     table = torch.cat(rows)
     wrong, is_right, is_near, confidence = table.mean(dim=0)
     assert wrong < 0.16
@@ -138,10 +156,13 @@ def test_generated_pixels_that_training_did_not_use():
 
 
 @pytest.mark.parametrize(
-    ("confidence", "codes"), [(0.35, ["gray_material", "roughness_undetermined"]), (0.8, ["gray_material"])]
+    ("confidence", "codes"),
+    [(0.35, ["gray_material", "roughness_undetermined"]), (0.8, ["gray_material"])],
 )
 def test_roughness_that_the_images_do_not_determine(confidence, codes):
-    values = np.tile(np.array((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence), np.float32), (SIZE, SIZE, 1))
+    values = np.tile(
+        np.array((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence), np.float32), (SIZE, SIZE, 1)
+    )
     warnings = material_warnings(material_facts(values, MASK))
     assert [warning.code for warning in warnings] == codes
     if "roughness_undetermined" in codes:
@@ -162,13 +183,18 @@ def test_pictures_under_other_lights():
 
 def test_likeness_of_known_noise():
     photographs = np.linspace(0, 1, 100_000, dtype=np.float32).reshape(-1, 10)
-    found = likeness(photographs, photographs + np.where(np.arange(10) % 2, 0.01, -0.01).astype(np.float32))
+    found = likeness(
+        photographs, photographs + np.where(np.arange(10) % 2, 0.01, -0.01).astype(np.float32)
+    )
     assert found.psnr_db == pytest.approx(40, abs=0.05)  # 0.01 of white
     assert found.error == pytest.approx(0.02, rel=0.01)  # of a mean of 0.5
 
 
 def test_channels_of_the_pictures():
-    values = np.tile(np.array((1, 0.5, 0, 0.2, 0.8, 3, 0.4), np.float32), (SIZE, SIZE, 1)) * MASK[..., None]
+    values = (
+        np.tile(np.array((1, 0.5, 0, 0.2, 0.8, 3, 0.4), np.float32), (SIZE, SIZE, 1))
+        * MASK[..., None]
+    )
     files = dict(map_files(MAPS["material"], values, MASK, ["tiff"]))
     assert set(files) == set(MAPS["material"].files)
     pictures = {
@@ -177,7 +203,12 @@ def test_channels_of_the_pictures():
         if name.endswith(".png")
     }
     middle = SIZE // 2, SIZE // 2
-    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [255, 51, 204]  # occlusion, roughness, metal
+    # occlusion, roughness, metal
+    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [
+        255,
+        51,
+        204,
+    ]
     assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
     assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
     assert files["specular.npy"][middle] == 3
@@ -191,11 +222,15 @@ def glossy(tmp_path: Path) -> Path:
     images = np.zeros((len(LIGHTS), SIZE, SIZE))
     images[:, MASK] = ggx_sphere(LIGHTS, diffuse=0.3, f0=0.05, roughness=0.4).T
     stored = np.rint(images.clip(0, 1) * 65535).astype(np.uint16)
-    return write_capture(tmp_path / "ball", stored, LIGHTS, mask=MASK, normals=NORMAL_MAP * MASK[..., None])
+    return write_capture(
+        tmp_path / "ball", stored, LIGHTS, mask=MASK, normals=NORMAL_MAP * MASK[..., None]
+    )
 
 
 def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
-    options = InferOptions(method="ls", maps=("material",), surface=True, output=str(tmp_path / "out"))
+    options = InferOptions(
+        method="ls", maps=("material",), surface=True, output=str(tmp_path / "out")
+    )
     report = infer_capture(glossy, options)
     folder = tmp_path / "out/ball"
     assert report["material"]["gray"]
@@ -214,7 +249,9 @@ def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
 
 def test_coloured_lamps_do_not_tint_gray_images(glossy, tmp_path):
     np.savetxt(glossy / "light_intensities.txt", np.tile((1.2, 1, 0.8), (len(LIGHTS), 1)))
-    report = infer_capture(glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out")))
+    report = infer_capture(
+        glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out"))
+    )
     assert "gray_material" in [warning["code"] for warning in report["warnings"]]
 
 
@@ -231,7 +268,11 @@ def test_colours_of_another_shape_are_refused(glossy):
 
 def test_three_lights_are_refused(glossy, tmp_path):
     options = InferOptions(
-        method="ls", maps=("material",), light_indices=(0, 1, 2), output=str(tmp_path / "out"), as_stored=True
+        method="ls",
+        maps=("material",),
+        light_indices=(0, 1, 2),
+        output=str(tmp_path / "out"),
+        as_stored=True,
     )
     with pytest.raises(InputError, match="--maps material needs at least 4 lights, found 3"):
         infer_capture(glossy, options)
@@ -246,7 +287,9 @@ def test_a_black_capture_has_some_material(tmp_path):
 
 
 def test_a_rendered_scene(tmp_path):
-    """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is wrong by 0.24."""
+    """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is
+    wrong by 0.24.
+    """
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
@@ -277,23 +320,41 @@ def test_colours_are_read_once_more(glossy):
 
 def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path):
     options = EvaluateOptions(
-        datasets=(glossy,), methods=("ls",), n_lights=(8,), trials=1, relight=True, output=str(tmp_path / "scores")
+        datasets=(glossy,),
+        methods=("ls",),
+        n_lights=(8,),
+        trials=1,
+        relight=True,
+        output=str(tmp_path / "scores"),
     )
     [found] = evaluate_captures(options).document["relighting"]
-    assert (found["capture"], found["method"], len(found["lights"]), found["held_out"]) == ("ball", "ls", 8, 4)
+    assert (found["capture"], found["method"], len(found["lights"]), found["held_out"]) == (
+        "ball",
+        "ls",
+        8,
+        4,
+    )
     assert found["material"]["psnr_db"] > found["lambertian"]["psnr_db"] + 1
     assert found["lambertian"]["psnr_db"] > found["nearest"]["psnr_db"]
     written = json.loads((tmp_path / "scores/results.json").read_text("utf-8"))
-    schema = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
+    schema = json.loads(
+        (Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8")
+    )
     jsonschema.Draft202012Validator({**schema, "$ref": "#/$defs/Results"}).validate(written)
 
 
 def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
     options = EvaluateOptions(
-        datasets=(glossy,), methods=("ls",), n_lights=(None,), relight=True, output=str(tmp_path / "scores")
+        datasets=(glossy,),
+        methods=("ls",),
+        n_lights=(None,),
+        relight=True,
+        output=str(tmp_path / "scores"),
     )
     outcome = evaluate_captures(options)
-    assert outcome.figure_problems == ["ball: the draw uses all lights, so none is held out. Use a smaller --n-lights."]
+    assert outcome.figure_problems == [
+        "ball: the draw uses all lights, so none is held out. Use a smaller --n-lights."
+    ]
 
 
 def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
@@ -308,11 +369,14 @@ def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
     np.testing.assert_array_equal(tinted.roughness, white.roughness)
     np.testing.assert_array_equal(tinted.metalness, white.metalness)
     ratio = np.median(tinted.base_colour / white.base_colour, axis=0)
-    np.testing.assert_allclose(ratio / ratio[1], gains, atol=0.1)  # white highlights are assumed to be white
+    # white highlights are assumed to be white
+    np.testing.assert_allclose(ratio / ratio[1], gains, atol=0.1)
 
 
 def test_integrate_keeps_the_material(glossy, tmp_path):
-    infer_capture(glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out")))
+    infer_capture(
+        glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out"))
+    )
     integrate_normal_map(IntegrateOptions(normals=tmp_path / "out/ball"))
     _, arrays = read_glb((tmp_path / "out/ball/mesh.glb").read_bytes())
     stored = cv2.imread(str(tmp_path / "out/ball/metallic_roughness.png"))[..., ::-1]

@@ -28,8 +28,8 @@ def test_unit_keeps_directions_and_zero_vectors() -> None:
     np.testing.assert_allclose(scaled, [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]], rtol=1e-15)
 
 
-# A step of 1 / 65535 in (n + 1) / 2 is off by at most 1 / 65535 in each component of n, sqrt(3) of that in length:
-# 0.0015 degrees. With 8 bits that is 0.39 degrees.
+# A step of 1 / 65535 in (n + 1) / 2 is off by at most 1 / 65535 in each component of n, sqrt(3) of
+# that in length: 0.0015 degrees. With 8 bits that is 0.39 degrees.
 @pytest.mark.parametrize(("bits", "limit_deg"), [(16, 0.0016), (8, 0.4)])
 def test_encode_and_decode_round_trip(bits: int, limit_deg: float) -> None:
     normals = random_normals(20_000).reshape(100, 200, 3)
@@ -44,7 +44,8 @@ def test_encode_and_decode_round_trip(bits: int, limit_deg: float) -> None:
 def test_known_colours() -> None:
     normals = np.array([[[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]]])
     picture = encode_picture(normals, np.array([[True, True, True]]), bits=8)
-    # 127.5 rounds to the even 128; 1.6 / 2 * 255 = 204; 1.8 / 2 * 255 = 229.5 rounds to 230 (229.5 is exact).
+    # 127.5 rounds to the even 128; 1.6 / 2 * 255 = 204; 1.8 / 2 * 255 = 229.5 rounds to 230 (229.5
+    # is exact).
     np.testing.assert_array_equal(picture, [[[128, 128, 255], [255, 128, 128], [128, 204, 230]]])
 
 
@@ -150,13 +151,17 @@ def test_a_sphere(sign: int) -> None:
     np.testing.assert_allclose(found[mask], expected, rtol=0.02)
     assert np.isnan(found[~mask]).all()
     slopes = gradient_of_normals(normal_map, mask)
-    np.testing.assert_allclose(slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5)
+    np.testing.assert_allclose(
+        slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5
+    )
 
 
 def test_a_cylinder_and_a_saddle() -> None:
     everywhere = np.ones(X.shape, bool)
     inner = np.hypot(X, Y) < 40
-    cylinder = curvature_of_normals(normals(-X / np.sqrt(RADIUS**2 - X**2), 0 * X), everywhere)[inner]
+    cylinder = curvature_of_normals(normals(-X / np.sqrt(RADIUS**2 - X**2), 0 * X), everywhere)[
+        inner
+    ]
     np.testing.assert_allclose(cylinder[:, 0], 0.5 / RADIUS, rtol=0.02)
     np.testing.assert_allclose(cylinder[:, 1], 0, atol=1e-6)
     # z = x y / R, whose curvature at the middle is -1/R^2 (Gauss) and 0 (mean).
@@ -165,9 +170,14 @@ def test_a_cylinder_and_a_saddle() -> None:
 
 
 def test_noise_falls_with_the_square_of_sigma() -> None:
-    noisy = unit(normals(0 * X, 0 * X) + 0.02 * np.random.default_rng(1).normal(size=(*X.shape, 3))).astype(np.float32)
+    noisy = unit(
+        normals(0 * X, 0 * X) + 0.02 * np.random.default_rng(1).normal(size=(*X.shape, 3))
+    ).astype(np.float32)
     inner = np.hypot(X, Y) < 40
-    spread = [curvature_of_normals(noisy, np.ones(X.shape, bool), sigma)[inner][:, 0].std() for sigma in (1.5, 3)]
+    spread = [
+        curvature_of_normals(noisy, np.ones(X.shape, bool), sigma)[inner][:, 0].std()
+        for sigma in (1.5, 3)
+    ]
     assert spread[0] / spread[1] == pytest.approx(4, rel=0.3)
 
 

@@ -1,4 +1,6 @@
-"""Observation maps: which cell a direction falls on, and the symmetries of what is laid out there."""
+"""Observation maps: which cell a direction falls on, and the symmetries of what is laid out
+there.
+"""
 
 import math
 from typing import Any
@@ -23,7 +25,9 @@ quick = settings(max_examples=25, deadline=None)
 
 
 def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
-    """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of a cell."""
+    """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of
+    a cell.
+    """
     generator = torch.Generator().manual_seed(seed)
     directions = torch.randn(lights, 3, generator=generator, dtype=torch.float64)
     directions[:, 2] = directions[:, 2].abs() + 0.05
@@ -31,28 +35,45 @@ def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
     return observations, torch.nn.functional.normalize(directions, dim=-1)
 
 
-# Ours: a cell is 1/16 wide; the axis runs between columns 15 and 16 and rows 15 and 16; row 0 is y = +1.
-# (0.6 + 1) * 16 = 25.6 and (1 - 0.3) * 16 = 11.2.
-# CNN-PS: floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is a single point.
-# (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15.
+# Ours: a cell is 1/16 wide; the axis runs between columns 15 and 16 and rows 15 and 16; row 0 is y
+# = +1. (0.6 + 1) * 16 = 25.6 and (1 - 0.3) * 16 = 11.2.
+# CNN-PS: floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is
+# a single point. (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15.
 CELLS = {
     "ours": [
-        (0.01, 0.01, 15, 16), (-0.01, 0.01, 15, 15), (0.01, -0.01, 16, 16), (-0.01, -0.01, 16, 15),
-        (0.0, 0.99, 0, 16), (0.0, 1.0, 0, 16), (0.0, -1.0, 31, 16), (1.0, 0.0, 16, 31), (-1.0, 0.0, 16, 0),
-        (1.0000001, 0.0, 16, 31), (0.6, 0.3, 11, 25),
+        (0.01, 0.01, 15, 16),
+        (-0.01, 0.01, 15, 15),
+        (0.01, -0.01, 16, 16),
+        (-0.01, -0.01, 16, 15),
+        (0.0, 0.99, 0, 16),
+        (0.0, 1.0, 0, 16),
+        (0.0, -1.0, 31, 16),
+        (1.0, 0.0, 16, 31),
+        (-1.0, 0.0, 16, 0),
+        (1.0000001, 0.0, 16, 31),
+        (0.6, 0.3, 11, 25),
     ],
     "cnn-ps": [
-        (0.01, 0.01, 16, 15), (-0.1, -0.1, 18, 13), (0.0, 1.0, 0, 15), (0.0, 0.99, 1, 15), (0.0, -1.0, 31, 15),
-        (1.0, 0.0, 16, 31), (0.99, 0.0, 16, 30), (-1.0, 0.0, 16, 0), (0.6, 0.3, 11, 24),
+        (0.01, 0.01, 16, 15),
+        (-0.1, -0.1, 18, 13),
+        (0.0, 1.0, 0, 15),
+        (0.0, 0.99, 1, 15),
+        (0.0, -1.0, 31, 15),
+        (1.0, 0.0, 16, 31),
+        (0.99, 0.0, 16, 30),
+        (-1.0, 0.0, 16, 0),
+        (0.6, 0.3, 11, 24),
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("grid", CELLS)
 def test_cell_of_a_known_direction(grid: Any) -> None:
     options = {} if grid == "ours" else {"grid": grid}
     for x, y, row, column in CELLS[grid]:
-        direction = torch.tensor((x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64)
+        direction = torch.tensor(
+            (x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64
+        )
         assert light_cells(direction, **options).item() == row * 32 + column, (x, y)
         occupied = sparse_map(torch.ones(1, 1), direction[None], **options).occupied
         assert occupied.flatten().nonzero().item() == row * 32 + column, (x, y)
@@ -79,7 +100,9 @@ def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
 
 
 def test_lights_in_one_cell_are_averaged() -> None:
-    directions = torch.tensor([[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]])
+    directions = torch.tensor(
+        [[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]]
+    )
     values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
     maps = sparse_map(values, directions)
     torch.testing.assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
@@ -106,7 +129,10 @@ SYMMETRIES = {
         lambda light: rotate_about_view_axis(light, ZERO, ONE),
         lambda maps: maps.rot90(1, (2, 3)),
     ),
-    "mirrored in y": (lambda lights: lights * torch.tensor((1.0, -1.0, 1.0)), lambda maps: maps.flip(2)),
+    "mirrored in y": (
+        lambda lights: lights * torch.tensor((1.0, -1.0, 1.0)),
+        lambda maps: maps.flip(2),
+    ),
 }
 
 
@@ -117,6 +143,9 @@ def test_maps_follow_the_lights(name: str, seed: int) -> None:
     change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
     order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))
-    one, other = sparse_map(observations, directions), sparse_map(observations[:, order], change(directions)[order])
+    one, other = (
+        sparse_map(observations, directions),
+        sparse_map(observations[:, order], change(directions)[order]),
+    )
     torch.testing.assert_close(other.values, changed(one.values))
     assert torch.equal(other.occupied, changed(one.occupied))

@@ -1,4 +1,6 @@
-"""Transfer curves: sRGB at known values, and profiles written here after ISO 15076-1, and one of LittleCMS."""
+"""Transfer curves: sRGB at known values, and profiles written here after ISO 15076-1, and one of
+LittleCMS.
+"""
 
 import io
 import struct
@@ -18,7 +20,13 @@ from scenes import with_chunk
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import TransferCurve, decode_transfer, encode_srgb, parse_transfer, profile_curve
+from splinecli.maths.transfer import (
+    TransferCurve,
+    decode_transfer,
+    encode_srgb,
+    parse_transfer,
+    profile_curve,
+)
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 STORED = np.linspace(0, 1, 1001).astype(np.float32)
@@ -38,13 +46,24 @@ def profile(*curves: bytes, space: bytes = b"RGB ", name: str = "Made up") -> by
     """A profile with one curve for each channel, or the same one for all."""
     names = (b"kTRC",) if space == b"GRAY" else (b"rTRC", b"gTRC", b"bTRC")
     text = name.encode("utf-16-be")
-    tags = [(b"desc", b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(text), 28) + text)]
+    tags = [
+        (b"desc", b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(text), 28) + text)
+    ]
     tags += [(name, curves[min(i, len(curves) - 1)]) for i, name in enumerate(names)]
     table, data, at = b"", b"", 132 + 12 * len(tags)
     for tag, content in tags:
         table += tag + struct.pack(">II", at + len(data), len(content))
         data += content
-    return bytes(16) + space + bytes(16) + b"acsp" + bytes(88) + struct.pack(">I", len(tags)) + table + data
+    return (
+        bytes(16)
+        + space
+        + bytes(16)
+        + b"acsp"
+        + bytes(88)
+        + struct.pack(">I", len(tags))
+        + table
+        + data
+    )
 
 
 def write(path: Path, icc: bytes | None, pixels: NDArray[Any] = PIXELS) -> Path:
@@ -123,7 +142,9 @@ def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
     assert read_header(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
-    assert read_header(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(1.0, by)
+    assert read_header(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(
+        1.0, by
+    )
     stated = read_header(write(path, b"no profile")).curve
     assert stated.unread and stated.curve == (None if suffix == ".jpg" else 1.0)
     assert not read_header(write(path, None)).curve.unread
@@ -156,14 +177,19 @@ def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) 
 def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix: str) -> None:
     adobe = capture(tmp_path / "adobe", profile(curv(563), name="Adobe RGB (1998)"), PIXELS, suffix)
     found = read_capture(adobe)
-    linear = read_capture(capture(tmp_path / "linear", profile(curv(256)), PIXELS, suffix), as_stored=True)
+    linear = read_capture(
+        capture(tmp_path / "linear", profile(curv(256)), PIXELS, suffix), as_stored=True
+    )
     assert "display_decoded" not in [warning.code for warning in linear.warnings]
     plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
     np.testing.assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
     np.testing.assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
     (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
-    assert '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear' in told
+    assert (
+        '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear'
+        in told
+    )
 
 
 def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
@@ -174,32 +200,49 @@ def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
     assert [warning.code for warning in source.warnings] == ["display_encoded"]
     unread = open_capture(capture(tmp_path / "b", profile(b"mft2" + bytes(40)), PIXELS, ".png"))
     (warning,) = unread.warnings
-    assert "The colour profile of 0.png has no curve" in str(warning) and "Add --transfer" in str(warning)
+    assert "The colour profile of 0.png has no curve" in str(warning) and "Add --transfer" in str(
+        warning
+    )
 
 
 def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:
     """The files written here are what other programs take them for."""
     for suffix in (".png", ".jpg", ".tif"):
-        path = write(tmp_path / f"a{suffix}", SRGB_PROFILE, PIXELS // 257 if suffix == ".tif" else PIXELS)
+        path = write(
+            tmp_path / f"a{suffix}", SRGB_PROFILE, PIXELS // 257 if suffix == ".tif" else PIXELS
+        )
         with Image.open(path) as image:
             content = image.info["icc_profile"]
-        assert ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(content))).startswith("sRGB")
+        assert ImageCms.getProfileDescription(
+            ImageCms.ImageCmsProfile(io.BytesIO(content))
+        ).startswith("sRGB")
 
 
 def test_srgb():
-    # Half of the codes is 0.2159 of the light; 18 % gray is 118; what lies outside 0 to 1 is cut off.
+    # Half of the codes is 0.2159 of the light; 18 % gray is 118; what lies outside 0 to 1 is cut
+    # off.
     values = np.array([0, 0.001, 0.18, 0.2159, 0.5, 1, -1, 3])
     assert encode_srgb(values).tolist() == [0, 3, 118, 128, 188, 255, 0, 255]
 
 
 def test_decoding_turns_encoding_back():
     codes = np.arange(256)
-    assert encode_srgb(decode_transfer((codes / 255).astype(np.float32), None)).tolist() == codes.tolist()
+    assert (
+        encode_srgb(decode_transfer((codes / 255).astype(np.float32), None)).tolist()
+        == codes.tolist()
+    )
     np.testing.assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
 
 
 def test_names_of_curves():
-    assert [parse_transfer(text) for text in ("auto", "linear", "srgb", "gamma:2.2")] == [1.0, 1.0, None, 2.2]
+    assert [parse_transfer(text) for text in ("auto", "linear", "srgb", "gamma:2.2")] == [
+        1.0,
+        1.0,
+        None,
+        2.2,
+    ]
     for text in ("", "sRGB", "gamma", "gamma:", "gamma:0", "gamma:1.2.3", "gamma:99"):
-        with pytest.raises(UsageError, match=r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10"):
+        with pytest.raises(
+            UsageError, match=r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10"
+        ):
             parse_transfer(text)

@@ -1,4 +1,5 @@
-"""Maps, plots and observation maps: known values have known colours at known places, in every size of picture.
+"""Maps, plots and observation maps: known values have known colours at known places, in every size
+of picture.
 
 PNG files keep every value; curves leave out what was not computed, and anything may be a title.
 """
@@ -22,7 +23,13 @@ from splinecli.pictures.maps import (
     encode_png,
     preview_picture,
 )
-from splinecli.pictures.plots import error_map_picture, method_maps, observation_map_figure, sky_plot, training_figure
+from splinecli.pictures.plots import (
+    error_map_picture,
+    method_maps,
+    observation_map_figure,
+    sky_plot,
+    training_figure,
+)
 
 
 def test_white_is_the_brightest_hundredth_of_the_mask():
@@ -47,8 +54,15 @@ def test_the_preview_is_brightest_where_the_surface_faces_the_light():
 
 
 def test_png_keeps_every_value(monkeypatch):
-    for dtype, shape in ((np.uint8, (7, 5)), (np.uint16, (7, 5)), (np.uint8, (7, 5, 3)), (np.uint16, (7, 5, 3))):
-        picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+    for dtype, shape in (
+        (np.uint8, (7, 5)),
+        (np.uint16, (7, 5)),
+        (np.uint8, (7, 5, 3)),
+        (np.uint16, (7, 5, 3)),
+    ):
+        picture = np.random.default_rng(0).integers(
+            0, np.iinfo(dtype).max, shape, dtype, endpoint=True
+        )
         stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
@@ -92,7 +106,9 @@ def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
     bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     assert len(bar) > 200
     assert bar.shape[1] >= 18
-    np.testing.assert_array_equal(bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0])
+    np.testing.assert_array_equal(
+        bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0]
+    )
     # Text: black ink right of the bar, and none cut at the picture's edges.
     right = picture[:, columns[-1] + 1 :]
     assert (right < 64).all(axis=2).sum() > 200
@@ -101,31 +117,49 @@ def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
 
 
 COLUMNS: dict[str, list[float | None]] = {
-    "step": [50, 100, 125], "loss": [2.0, 1.0, 0.5], "symmetric": [None, 0.5, None], "asymmetric": [None] * 3,
-    "angle_deg": [20.0, 10.0, 8.0], "validation_deg": [None, 12.5, 9.0],
-    "map_error": [0.2, 0.1, 0.08], "masked_map_error": [0.1, 0.05, 0.04],
-}  # fmt: skip
+    "step": [50, 100, 125],
+    "loss": [2.0, 1.0, 0.5],
+    "symmetric": [None, 0.5, None],
+    "asymmetric": [None] * 3,
+    "angle_deg": [20.0, 10.0, 8.0],
+    "validation_deg": [None, 12.5, 9.0],
+    "map_error": [0.2, 0.1, 0.08],
+    "masked_map_error": [0.1, 0.05, 0.04],
+}
 
 
 def lines(axes: Any) -> dict[str, list[list[float]]]:
-    return {line.get_label(): [list(map(float, values)) for values in line.get_data()] for line in axes.lines}
+    return {
+        line.get_label(): [list(map(float, values)) for values in line.get_data()]
+        for line in axes.lines
+    }
 
 
 def test_each_curve_leaves_out_what_was_not_computed() -> None:
     loss, angle, maps = training_figure(COLUMNS).axes
     steps = [50, 100, 125]
-    assert lines(loss) == {"weighted sum": [steps, [2.0, 1.0, 0.5]], "Ls, unweighted": [[100], [0.5]]}
+    assert lines(loss) == {
+        "weighted sum": [steps, [2.0, 1.0, 0.5]],
+        "Ls, unweighted": [[100], [0.5]],
+    }
     assert lines(angle) == {"training": [steps, [20, 10, 8]], "validation": [[100, 125], [12.5, 9]]}
-    assert lines(maps) == {"all cells": [steps, [0.2, 0.1, 0.08]], "cells with a light": [steps, [0.1, 0.05, 0.04]]}
+    assert lines(maps) == {
+        "all cells": [steps, [0.2, 0.1, 0.08]],
+        "cells with a light": [steps, [0.1, 0.05, 0.04]],
+    }
     assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
     assert loss.get_title() == "loss"
     assert loss.get_yscale() == "linear"
 
 
 def test_scales_and_hidden_axes() -> None:
-    """Wide curves are logarithmic unless a value is zero; without a LI-Net, the map errors are hidden."""
+    """Wide curves are logarithmic unless a value is zero; without a LI-Net, the map errors are
+    hidden.
+    """
     for middle, scale in ((1.0, "log"), (0.0, "linear")):
-        assert training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
+        assert (
+            training_figure(COLUMNS | {"loss": [50.0, middle, 0.5]}).axes[0].get_yscale() == scale
+        )
     columns = COLUMNS | {"map_error": [None] * 3, "masked_map_error": [None] * 3}
     assert [axes.get_visible() for axes in training_figure(columns).axes] == [True, True, False]
 
@@ -141,7 +175,9 @@ def test_a_name_that_is_not_printable_or_a_formula(name: str) -> None:
 def draw(
     height: int, width: int, methods: list[str], error_deg: float = 12.0, title: str = "title"
 ) -> NDArray[np.uint8]:
-    """A mask that leaves a margin of two pixels free, ground truth (0, 0, 1), estimates along (1, 0, 1)."""
+    """A mask that leaves a margin of two pixels free, ground truth (0, 0, 1), estimates along (1,
+    0, 1).
+    """
     mask = np.zeros((height, width), bool)
     mask[2:-2, 2:-2] = True
     truth = np.zeros((height, width, 3), np.float32)
@@ -153,9 +189,13 @@ def draw(
     return decode_rgb(method_maps(truth, mask, estimates, error_maps, title=title))
 
 
-def places_of(colour: tuple[int, ...], picture: NDArray[np.uint8]) -> list[tuple[int, int, int, int]]:
+def places_of(
+    colour: tuple[int, ...], picture: NDArray[np.uint8]
+) -> list[tuple[int, int, int, int]]:
     """Boxes (top, left, height, width) of the large connected areas of a colour, from the left."""
-    _, _, boxes, _ = cv2.connectedComponentsWithStats((picture == colour).all(axis=2).astype(np.uint8))
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(
+        (picture == colour).all(axis=2).astype(np.uint8)
+    )
     return sorted((int(y), int(x), int(h), int(w)) for x, y, w, h, area in boxes[1:] if area > 500)
 
 
@@ -176,7 +216,9 @@ def test_colours_stand_where_they_belong(height: int, width: int, n_methods: int
     assert len(normals) == len(errors) == n_methods
     # Cut to the mask's box and enlarged by a whole factor, all alike.
     factor = truth[2] // (height - 4)
-    assert {place[2:] for place in (truth, *normals, *errors)} == {(factor * (height - 4), factor * (width - 4))}
+    assert {place[2:] for place in (truth, *normals, *errors)} == {
+        (factor * (height - 4), factor * (width - 4))
+    }
     # One row of normals, ground truth first; each method's errors below its normals.
     assert {place[0] for place in normals} == {truth[0]}
     assert truth[1] < normals[0][1]
@@ -201,7 +243,10 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale() -> 
     picture = draw(300, 300, ["ls"])
     for error_deg in (0.0, TOP_DEG / 2, TOP_DEG):
         assert (picture == error_colour(error_deg)).all(axis=2).sum() >= 10
-    long = "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 degrees $x$"
+    long = (
+        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2"
+        " degrees $x$"
+    )
     for methods in (["ls"], ["a method with a long name", "b"]):
         picture = draw(20, 30, methods, title=long)
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
@@ -209,14 +254,26 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale() -> 
 
 
 SIZE = 8
-CELL_YELLOW, CELL_VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255
+# viridis' ends; 0.85 of 255
+CELL_YELLOW, CELL_VIOLET, GRAY = (
+    (253, 231, 36),
+    (68, 1, 84),
+    (217, 217, 217),
+)
 
 
 @cache
 def draw_cells(
-    n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
+    n_pixels: int,
+    *,
+    with_truth: bool = True,
+    with_dense: bool = True,
+    named: bool = True,
+    grid: str = "even",
 ) -> NDArray[np.uint8]:
-    """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is empty."""
+    """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is
+    empty.
+    """
     sparse = np.full((n_pixels, SIZE, SIZE), np.nan, np.float32)
     sparse[:, 1, 5] = 1
     png = observation_map_figure(
@@ -259,7 +316,11 @@ def test_empty_cells_are_gray_and_the_truth_may_be_missing() -> None:
 
 
 def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map() -> None:
-    whole, unnamed, without = draw_cells(2), draw_cells(2, named=False), draw_cells(2, named=False, with_dense=False)
+    whole, unnamed, without = (
+        draw_cells(2),
+        draw_cells(2, named=False),
+        draw_cells(2, named=False, with_dense=False),
+    )
     assert len(boxes(unnamed, CELL_YELLOW)) == len(boxes(without, CELL_YELLOW)) == 2
     assert boxes(unnamed, CELL_YELLOW)[0][1] < boxes(whole, CELL_YELLOW)[0][1]  # no title above
     assert without.shape[1] < unnamed.shape[1]

@@ -23,8 +23,16 @@ def put(path: Path, content: str = "image") -> None:
 
 def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path) -> None:
     clock = Clock()
-    arrivals = Arrivals(tmp_path, marker=None, seconds=5, without=tmp_path / "out/results", clock=clock)
-    for name in ("part10/1.png", "part9/images/1.png", "out/results/part1/normals.png", ".hidden/1.png", "loose.png"):
+    arrivals = Arrivals(
+        tmp_path, marker=None, seconds=5, without=tmp_path / "out/results", clock=clock
+    )
+    for name in (
+        "part10/1.png",
+        "part9/images/1.png",
+        "out/results/part1/normals.png",
+        ".hidden/1.png",
+        "loose.png",
+    ):
         put(tmp_path / name)
     (tmp_path / "empty").mkdir()
     assert arrivals.take() == []
@@ -42,7 +50,9 @@ def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path
     assert arrivals.take() == [tmp_path / "part10"]
 
 
-def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_files_of_a_capture_that_is_done_are_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A folder of a thousand captures would be read again each second."""
     clock, walked = Clock(), list[Path]()
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out", clock=clock)
@@ -61,7 +71,9 @@ def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path: Path, monk
     assert arrivals.take() == [done]
 
 
-def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(tmp_path: Path) -> None:
+def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(
+    tmp_path: Path,
+) -> None:
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
     put(tmp_path / "part10/1.png")
     put(tmp_path / "part9/1.png")

@@ -1,4 +1,6 @@
-"""Items on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
+"""Items on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many
+captures.
+"""
 
 import json
 import re
@@ -20,7 +22,13 @@ from splinecli.errors import InputError, ModelError, OutputError, SplinecliError
 from splinecli.maths.normals import unit
 from splinecli.pipeline import batch
 from splinecli.pipeline import distribution as distribution_module
-from splinecli.pipeline.batch import BatchItem, choose_workers, expected_bytes, infer_batch, list_captures
+from splinecli.pipeline.batch import (
+    BatchItem,
+    choose_workers,
+    expected_bytes,
+    infer_batch,
+    list_captures,
+)
 from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
 from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
@@ -89,17 +97,23 @@ def test_items_share_the_memory_of_a_machine(client, work, monkeypatch):
     beside = run(client, work(worker_tasks.count_neighbours), numbered(range(20), GB / 2))
     assert 2 in beside.values()
     # An item that seems too large runs alone: the capture itself checks its memory.
-    assert set(run(client, work(worker_tasks.count_neighbours), numbered(range(2), 1e18)).values()) == {1}
+    assert set(
+        run(client, work(worker_tasks.count_neighbours), numbered(range(2), 1e18)).values()
+    ) == {1}
 
 
 def test_a_task_for_no_worker(client, work):
     """A limit that Dask holds a worker to is known before the task kills the worker."""
     client.run(worker_tasks.set_resources, MEMORY=4 * GB)
     try:
-        results = run(client, work(worker_tasks.double), [*numbered(range(2), GB), Item((2,), "big", 5 * GB)])
+        results = run(
+            client, work(worker_tasks.double), [*numbered(range(2), GB), Item((2,), "big", 5 * GB)]
+        )
     finally:
         client.run(worker_tasks.set_resources, MEMORY=1000 * GB)
-    assert str(results.pop(2)).startswith("big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB.")
+    assert str(results.pop(2)).startswith(
+        "big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB."
+    )
     assert results == {0: 0, 1: 2}
 
 
@@ -107,13 +121,15 @@ def test_workers_that_do_not_fit(client, work, tmp_path):
     good = work(worker_tasks.double)
     cases = {
         "found splinecli [0-9.]+, expected 9.9 as on this machine": (
-            UsageError, replace(good, versions={**good.versions, "splinecli": "9.9"}),
+            UsageError,
+            replace(good, versions={**good.versions, "splinecli": "9.9"}),
         ),
         "nowhere: the folder cannot be entered": (InputError, replace(good, folder="nowhere")),
         "elsewhere: the folder is not the one of this machine": (
-            InputError, replace(good, probe=str(tmp_path / "elsewhere/probe")),
+            InputError,
+            replace(good, probe=str(tmp_path / "elsewhere/probe")),
         ),
-    }  # fmt: skip
+    }
     for message, (kind, other) in cases.items():
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
         distributor = Distributor(client, other, ClusterOptions(), SILENT)
@@ -126,14 +142,20 @@ def test_gpu_workers_only(client, work):
         run(client, work(worker_tasks.double), numbered(range(3)), gpu=True)
     client.run(worker_tasks.set_resources, GPU=1)
     try:
-        assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {0: 0, 1: 2, 2: 4}
+        assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {
+            0: 0,
+            1: 2,
+            2: 4,
+        }
     finally:
         client.run(worker_tasks.set_resources, GPU=0)
 
 
 def write_captures(names: list[str]) -> list[str]:
     """Write small captures of different content into the working folder; `broken` has no images."""
-    lights = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
+    lights = unit(
+        np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
+    )
     for seed, name in enumerate(names):
         images = np.random.default_rng(seed).integers(20_000, 50_000, (5, 12, 15), np.uint16)
         write_capture(Path(name), images[: 0 if name == "broken" else 5], lights)
@@ -164,7 +186,10 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
     together = documents("-o", "out", "--cluster", cluster.scheduler_address)
     assert comparable(together) == comparable(alone)
     assert results_in("out") == expected
-    rows = [re.findall(r'<th scope="row">.*', Path(f"{place}/index.html").read_text()) for place in ("out", "alone")]
+    rows = [
+        re.findall(r'<th scope="row">.*', Path(f"{place}/index.html").read_text())
+        for place in ("out", "alone")
+    ]
     assert rows[0] == rows[1] and len(rows[0]) == len(names)
     assert sorted(path.name for path in Path("out").iterdir()) == ["a", "b", "c", "d", "index.html"]
     # What is done is skipped: the reports have the seconds of the first run.
@@ -182,7 +207,9 @@ def test_the_cores_are_shared_out(monkeypatch, work):
 
 
 def test_shards_side_by_side_share_a_folder(cluster, tmp_path, capfd):
-    """Another batch that writes the index of the folder leaves the mark by which workers know it."""
+    """Another batch that writes the index of the folder leaves the mark by which workers know
+    it.
+    """
     call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls", "-o", "out"]
     options = ClusterOptions(address=cluster.scheduler_address)
     with distributor(partial(worker_tasks.double, "out"), Path("out"), options, SILENT) as workers:
@@ -207,17 +234,30 @@ def test_no_scheduler(monkeypatch):
     monkeypatch.setattr(distribution_module, "_CONNECT_SECONDS", 0.2)
     monkeypatch.setattr(distribution_module, "_ANSWER_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:  # no scheduler
-        addresses = ["tcp://127.0.0.1:1", "strange://x", "http://x", "none.json", "broken.json", "tcp://"]
+        addresses = [
+            "tcp://127.0.0.1:1",
+            "strange://x",
+            "http://x",
+            "none.json",
+            "broken.json",
+            "tcp://",
+        ]
         for address in (*addresses, f"tcp://127.0.0.1:{server.getsockname()[1]}"):
-            with pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"):
+            with pytest.raises(
+                UsageError, match=r"no Dask scheduler answers at|expected an address such as"
+            ):
                 distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
     member = BatchItem(tmp_path / "unseen", "unseen")
-    outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
-    expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
+    outcome, _ = client.submit(
+        batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False
+    ).result()
+    expected = (
+        rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
+    )
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 
 
@@ -226,7 +266,18 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
     for name in names[:3]:
         np.save(f"{name}/normals_gt.npy", np.float32(np.broadcast_to([0, 0, 1], (12, 15, 3))))
     Path("data/damaged/002.png").write_bytes(b"no picture")
-    call = ["evaluate", "data", "--method", "ls", "--method", "iw12", "--n-lights", "3", "--n-lights", "all"]
+    call = [
+        "evaluate",
+        "data",
+        "--method",
+        "ls",
+        "--method",
+        "iw12",
+        "--n-lights",
+        "3",
+        "--n-lights",
+        "all",
+    ]
 
     def results(output: str, *more: str) -> Any:
         assert main([*call, "-o", output, *more]) == 3
@@ -245,13 +296,19 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
 
 
 def test_errors_travel(client):
-    for error in (InputError("wrong", path="a", line=3, hint="Do it"), OutputError("full"), SplinecliError("x")):
+    for error in (
+        InputError("wrong", path="a", line=3, hint="Do it"),
+        OutputError("full"),
+        SplinecliError("x"),
+    ):
         found = client.submit(lambda error: error, error, pure=False).result()
         assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
 
 
 def test_the_number_of_workers(tmp_path, monkeypatch):
-    """Captures of 12 x 15 pixels take little; the machine of the test has four cores and memory for three."""
+    """Captures of 12 x 15 pixels take little; the machine of the test has four cores and memory for
+    three.
+    """
     members = list_captures([Path(name) for name in write_captures(["a", "broken", "c", "d", "e"])])
     options = InferOptions(method="ls")
     assert 0 < expected_bytes(members[0], options) < 10**6

@@ -39,7 +39,9 @@ class Slow(Teacher):
     random: bool = False
     seconds: float = 0.0
 
-    def estimate_with_error(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+    def estimate_with_error(
+        self, observations: Any, light_directions: Any, *, progress: Any = None
+    ) -> Any:
         self.asked += len(observations)
         time.sleep(self.seconds)
         errors = np.tile(np.float32((np.log(np.radians(3)), 0.7)), (len(observations), 1))
@@ -82,13 +84,19 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
     teacher = Slow(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None
-    assert warning.code == "not_distilled" and "where it expects errors of 2.9 degrees" in warning.text
+    assert (
+        warning.code == "not_distilled" and "where it expects errors of 2.9 degrees" in warning.text
+    )
     assert teacher.asked == 500 + 900  # both sizes were tried
 
 
 def test_refused() -> None:
     for few, estimator, problem in (
-        (capture(3000), LeastSquares(), "method ls does not provide confidence and cannot be distilled"),
+        (
+            capture(3000),
+            LeastSquares(),
+            "method ls does not provide confidence and cannot be distilled",
+        ),
         (capture(200), Slow(), "matte: 200 pixels are too few to distil"),
     ):
         with pytest.raises(UsageError, match=problem):

@@ -1,4 +1,6 @@
-"""Albedo maps of a coloured sphere with highlights and cast shadows, compared with its known albedo."""
+"""Albedo maps of a coloured sphere with highlights and cast shadows, compared with its known
+albedo.
+"""
 
 from pathlib import Path
 
@@ -13,14 +15,20 @@ from splinecli.lights.calibration.lamps import measure_light_intensities
 from splinecli.results.map_values import albedo_map
 
 SIZE = 40
-INTENSITIES = np.array([(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)])
-LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)])
+INTENSITIES = np.array(
+    [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
+)
+LIGHTS = np.array(
+    [(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)]
+)
 LIGHTS = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
 
 
 @pytest.fixture
 def scene(tmp_path: Path):
-    """Folder, true normals and true albedo of a capture; some pixels have a highlight or a shadow under one light."""
+    """Folder, true normals and true albedo of a capture; some pixels have a highlight or a shadow
+    under one light.
+    """
     x, y = square_grid(SIZE, 1 - 1 / SIZE)
     inside = np.hypot(x, y) < 0.9
     z = np.sqrt(np.where(inside, 1 - x**2 - y**2, 1))
@@ -37,13 +45,17 @@ def scene(tmp_path: Path):
 
 
 def test_a_gray_target_balances_the_colours(scene, tmp_path):
-    """With the intensities that calibrate measures on a gray card under coloured lamps, what is gray looks gray."""
+    """With the intensities that calibrate measures on a gray card under coloured lamps, what is
+    gray looks gray.
+    """
     folder, normals, _ = scene
     (tmp_path / "card").mkdir()
     tint = INTENSITIES * (1, 0.7, 0.4)
     for number, (light, colour) in enumerate(zip(LIGHTS, tint, strict=True)):
         card = np.broadcast_to(0.5 * light[2] * colour * 65535, (20, 20, 3))
-        cv2.imwrite(str(tmp_path / f"card/{number}.png"), np.rint(card[..., ::-1]).astype(np.uint16))
+        cv2.imwrite(
+            str(tmp_path / f"card/{number}.png"), np.rint(card[..., ::-1]).astype(np.uint16)
+        )
         gray = 0.4 * (normals @ light).clip(0)[..., None] * colour * 65535
         cv2.imwrite(str(folder / f"{number}.png"), np.rint(gray[..., ::-1]).astype(np.uint16))
     measured = measure_light_intensities(find_ball_files(tmp_path / "card"), LIGHTS, "card")
@@ -56,7 +68,9 @@ def test_a_gray_target_balances_the_colours(scene, tmp_path):
 
 
 def test_restored_pixels_do_not_spoil_it(scene):
-    """The stored colours of overexposed pixels are too dark, so their other observations give the albedo."""
+    """The stored colours of overexposed pixels are too dark, so their other observations give the
+    albedo.
+    """
     folder, normals, albedo = scene
     for path in folder.glob("[0-9].png"):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
@@ -88,7 +102,9 @@ def test_albedo_in_colour(scene):
     assert np.quantile(error, 0.99) < 0.12
     # The plain mean over the lights is wrong here, so the choice of observations matters.
     capture = source.read()
-    plain = (capture.observations / (normals[inside] @ capture.light_directions.T).clip(0.15)).mean(axis=1)
+    plain = (capture.observations / (normals[inside] @ capture.light_directions.T).clip(0.15)).mean(
+        axis=1
+    )
     assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
     # Where no light reaches the surface, it is black.
     turned = albedo_map(source, source.read(), (normals * (1, 1, -1)).astype(np.float32))

@@ -1,6 +1,8 @@
-"""The page loads nothing, escapes names, stores the normals exactly, and lights them by Lambert's law.
+"""The page loads nothing, escapes names, stores the normals exactly, and lights them by Lambert's
+law.
 
-The pages share one head, one set of colours and one list of terms, and open without errors in a browser.
+The pages share one head, one set of colours and one list of terms, and open without errors in a
+browser.
 """
 
 import base64
@@ -30,7 +32,10 @@ from splinecli.records.output_files import NORMALS
 from splinecli.results import pages as page_module
 from splinecli.results.pages import Entry, Row, index_page, result_page
 
-HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
+HOSTILE = (
+    '</script><script>document.title = "x"</script>'
+    """'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
+)
 LONGEST_SIDE = 1600  # of a reduced map
 
 
@@ -47,7 +52,9 @@ class Page(HtmlPage):
 
     def picture(self, alternative_text: str) -> NDArray[np.uint8]:
         """RGB of the image with this alternative text."""
-        (source,) = (a["src"] for tag, a in self.tags if tag == "img" and a["alt"] == alternative_text)
+        (source,) = (
+            a["src"] for tag, a in self.tags if tag == "img" and a["alt"] == alternative_text
+        )
         png = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
         picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
         if picture.ndim == 2:
@@ -63,8 +70,12 @@ class Page(HtmlPage):
 
 def test_it_stands_alone() -> None:
     normals, mask = ball(40)
-    html = result_page(REPORT, normals, mask, values={"albedo": normals + 1}, error_map_deg=normals[..., 0] * 40)
-    outside = r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\("""
+    html = result_page(
+        REPORT, normals, mask, values={"albedo": normals + 1}, error_map_deg=normals[..., 0] * 40
+    )
+    outside = (
+        r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\("""
+    )
     assert not re.search(outside, html)
     policy = next(a["content"] for tag, a in Page(html).tags if tag == "meta" and "http-equiv" in a)
     assert policy.startswith("default-src 'none'; img-src data:;")
@@ -74,14 +85,27 @@ def test_figures_and_pictures() -> None:
     normals, mask = ball(40)
     errors = np.where(mask, 90 * normals[..., 2], np.nan).astype(np.float32)
     report = {**REPORT, "warnings": [{"code": "eight_bit", "text": "The images are 8-bit."}]}
-    maps = {"albedo": np.full_like(normals, 0.3) * mask[..., None], "confidence": mask.astype(np.float32) * 0.6}
+    maps = {
+        "albedo": np.full_like(normals, 0.3) * mask[..., None],
+        "confidence": mask.astype(np.float32) * 0.6,
+    }
     page = Page(result_page(report, normals, mask, values=maps, error_map_deg=errors))
     assert page.text["h1"] == page.text["title"] == ["Photometric stereo: ball"]
     assert page.facts == {
-        "Mean": "9.06°", "Median": "6.24°", "90th percentile": "18.10°", "Under 5°": "37.2%", "Under 10°": "75.0%",
-        "Method": "spline-net", "Weights": "blobby-7", "Lights": "10", "Pixels": "45,200", "Size": "296 × 321",
-        "Likely within 5°": "81% of the pixels", "Seconds": "read 0.6", "Device": "cpu, float32",
-    }  # fmt: skip
+        "Mean": "9.06°",
+        "Median": "6.24°",
+        "90th percentile": "18.10°",
+        "Under 5°": "37.2%",
+        "Under 10°": "75.0%",
+        "Method": "spline-net",
+        "Weights": "blobby-7",
+        "Lights": "10",
+        "Pixels": "45,200",
+        "Size": "296 × 321",
+        "Likely within 5°": "81% of the pixels",
+        "Seconds": "read 0.6",
+        "Device": "cpu, float32",
+    }
     assert page.text["li"] == ["The images are 8-bit."]
     assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]
     assert (page.picture("Albedo map")[20, 20] == 255).all()  # the brightest hundredth is white
@@ -93,7 +117,10 @@ def test_figures_and_pictures() -> None:
 def test_names_are_text() -> None:
     normals, mask = ball(40)
     hostile = dict.fromkeys(("capture", "method", "device", "version"), HOSTILE)
-    hostile |= {"weights": {"name": HOSTILE, "sha256": ""}, "warnings": [{"code": "", "text": HOSTILE}]}
+    hostile |= {
+        "weights": {"name": HOSTILE, "sha256": ""},
+        "warnings": [{"code": "", "text": HOSTILE}],
+    }
     page = Page(result_page({**REPORT, **hostile}, normals, mask))
     plain = Page(result_page({**REPORT, "warnings": [{"code": "", "text": "w"}]}, normals, mask))
     assert [tag for tag, _ in page.tags] == [tag for tag, _ in plain.tags]
@@ -104,7 +131,8 @@ def test_names_are_text() -> None:
 
 def test_the_normals_survive() -> None:
     random = np.random.default_rng(0)
-    normals = unit(random.normal(size=(70, 90, 3))).astype(np.float32)  # all round, those seen from behind, too
+    # all round, those seen from behind, too
+    normals = unit(random.normal(size=(70, 90, 3))).astype(np.float32)
     mask = random.random((70, 90)) < 0.8
     decoded = Page(result_page(REPORT, normals * mask[..., None], mask)).normals()
     assert (decoded.any(axis=2) == mask).all()
@@ -112,17 +140,24 @@ def test_the_normals_survive() -> None:
 
 
 def test_large_maps_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two flat faces side by side keep their normals and colours: the background does not change the means."""
+    """Two flat faces side by side keep their normals and colours: the background does not change
+    the means.
+    """
     monkeypatch.setattr(page_module, "LARGEST_MAP", LONGEST_SIDE * 150)
     width, height = 2 * LONGEST_SIDE, 300
     faces = unit(np.array([[0.6, 0.2, 0.5], [-0.9, 0.1, 0.3]], np.float32))
     mask = np.ones((height, width), bool)
     mask[:101] = False
-    normals = faces[(np.arange(width) >= LONGEST_SIDE).astype(int)][None].repeat(height, 0) * mask[..., None]
+    normals = (
+        faces[(np.arange(width) >= LONGEST_SIDE).astype(int)][None].repeat(height, 0)
+        * mask[..., None]
+    )
     albedo = np.float32([0.5, 0.25, 0.125]) * mask[..., None]
     errors = np.where(mask, np.float32(12), np.nan)
     material = np.float32([0.5, 0.25, 0.125, 0.4, 0, 0.5, 1]) * mask[..., None]
-    html = result_page(REPORT, normals, mask, values={"albedo": albedo}, material=material, error_map_deg=errors)
+    html = result_page(
+        REPORT, normals, mask, values={"albedo": albedo}, material=material, error_map_deg=errors
+    )
     page = Page(html)
     decoded = page.normals()
     assert decoded.shape == (150, LONGEST_SIDE, 3)
@@ -149,17 +184,25 @@ async (fragment) => {
 """
 
 
-def views(open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True) -> list[NDArray[np.int64]]:
+def views(
+    open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True
+) -> list[NDArray[np.int64]]:
     """Screenshots of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
-    # At the window's edge the view would be under the place where a headless browser's pointer rests.
+    # At the window's edge the view would be under the place where a headless browser's pointer
+    # rests.
     edge = 64
     style = (
-        f".surface {{ position: fixed !important; left: {edge}px; top: {edge}px; width: {SIDE}px !important }}"
+        f".surface {{ position: fixed !important; left: {edge}px; top: {edge}px; width: {SIDE}px"
+        " !important }"
         "#view { border-radius: 0 }"
     )
-    page = open_page(html.replace("</head>", f"<style>{style}</style></head>"), fragments[0], webgl=webgl)
+    page = open_page(
+        html.replace("</head>", f"<style>{style}</style></head>"), fragments[0], webgl=webgl
+    )
     page.evaluate("splinecli.ready")
-    assert page.evaluate("document.getElementById('view').dataset.renderer") == ("webgl" if webgl else "software")
+    assert page.evaluate("document.getElementById('view').dataset.renderer") == (
+        "webgl" if webgl else "software"
+    )
     seen = []
     for fragment in fragments:
         if fragment != fragments[0]:
@@ -177,7 +220,8 @@ def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -
     pictures = views(open_page, html, [f"light={x},{y}&specular=0" for x, y in lights], webgl=webgl)
     for (x, y), seen in zip(lights, pictures, strict=True):
         expected = encode_srgb(np.maximum(normals @ light_at(x, y), 0)).astype(int)
-        # Half a level each for the screen and the picture, and one where sRGB is steep: 13 bits of the normal there.
+        # Half a level each for the screen and the picture, and one where sRGB is steep: 13 bits of
+        # the normal there.
         assert np.abs(seen - expected[..., None]).max() <= 2
         rows, columns = np.nonzero(seen[..., 0] > 250)
         assert np.sign(columns.mean() - SIDE / 2) == np.sign(x)  # the lit side follows the light
@@ -187,21 +231,31 @@ def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -
 def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:
     """The view shows Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
     normals, mask = ball()
-    albedo = np.where(np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5]))
+    albedo = np.where(
+        np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5])
+    )
     albedo = albedo[:, None].repeat(SIDE, 1).reshape(SIDE, SIDE, 3) * mask[..., None]
     gain, shininess, light = 0.2, 64, light_at(-0.5, 0.4)
     cosine = np.maximum(normals @ light, 0)[..., None]
-    lobe = (shininess + 8) / 8 * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
+    lobe = (
+        (shininess + 8)
+        / 8
+        * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
+    )
     stored = decode_transfer(albedo_picture(albedo, mask).astype(np.float32) / 255, None)
 
     html = result_page(REPORT, normals, mask, values={"albedo": albedo})
     fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
-    for base, seen in zip((stored, 1), views(open_page, html, [fragment, f"{fragment}&albedo=0"]), strict=True):
+    for base, seen in zip(
+        (stored, 1), views(open_page, html, [fragment, f"{fragment}&albedo=0"]), strict=True
+    ):
         expected = encode_srgb(((1 - gain) * base + gain * lobe) * cosine)
         assert np.abs(seen - expected).max() <= 3
 
 
-def glossy(n: NDArray[np.floating], light: NDArray[np.floating], exponent: float) -> NDArray[np.floating]:
+def glossy(
+    n: NDArray[np.floating], light: NDArray[np.floating], exponent: float
+) -> NDArray[np.floating]:
     return np.maximum(n @ unit(light + np.array((0, 0, 1))), 0) ** exponent
 
 
@@ -220,7 +274,9 @@ def test_views_ambient_light_and_confidence(open_page: OpenPage, webgl: bool) ->
         f"view=shaded&ambient={ambient}": encode_srgb((1 - ambient) * cosine + ambient * sky),
         "ambient=0&confidence=1": encode_srgb(cosine),
     }
-    pictures = views(open_page, html, [f"light=0.8,-0.1&{choice}" for choice in expected], webgl=webgl)
+    pictures = views(
+        open_page, html, [f"light=0.8,-0.1&{choice}" for choice in expected], webgl=webgl
+    )
     sure = mask & (np.arange(SIDE) < SIDE // 2 - 1)
     for (choice, picture), seen in zip(expected.items(), pictures, strict=True):
         picture = picture if picture.ndim == 3 else picture[..., None]
@@ -234,22 +290,29 @@ def test_views_ambient_light_and_confidence(open_page: OpenPage, webgl: bool) ->
 
 @pytest.mark.parametrize("webgl", [True, False])
 def test_zoom_shows_a_part_of_the_same_picture(open_page: OpenPage, webgl: bool) -> None:
-    """Zoom 2 around (80, 100) shows the map's pixels 16 to 144 and 36 to 164; the sphere is known at any place."""
+    """Zoom 2 around (80, 100) shows the map's pixels 16 to 144 and 36 to 164; the sphere is known
+    at any place.
+    """
     html = result_page(REPORT, *ball())
     [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0&zoom=2,80,100"], webgl=webgl)
     whole, _ = ball(2 * SIDE)
     normals = whole[2 * 36 : 2 * 164, 2 * 16 : 2 * 144]
     expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
     smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
-    # Without WebGL, the nearest pixel of the map is shown: at most 1/4 of a pixel away, where shading has this slope.
+    # Without WebGL, the nearest pixel of the map is shown: at most 1/4 of a pixel away, where
+    # shading has this slope.
     assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
 
 
 def material_of_ball(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Painted on the left, metal on the right, rougher from the top to the bottom; as the pictures store it."""
+    """Painted on the left, metal on the right, rougher from the top to the bottom; as the pictures
+    store it.
+    """
     down, right = np.mgrid[:SIDE, :SIDE] / SIDE
     roughness = np.rint(255 * (0.25 + 0.5 * down)) / 255
-    reflectance = decode_transfer(encode_srgb(np.full((SIDE, SIDE), 0.04)).astype(np.float32) / 255, None)
+    reflectance = decode_transfer(
+        encode_srgb(np.full((SIDE, SIDE), 0.04)).astype(np.float32) / 255, None
+    )
     base = decode_transfer(np.full((SIDE, SIDE, 3), np.float32([200, 90, 60])) / 255, None)
     columns = roughness, (right > 0.5).astype(float), reflectance / 0.08, mask.astype(float)
     return (np.dstack((base, *columns)) * mask[..., None]).astype(np.float32)
@@ -259,11 +322,15 @@ def material_of_ball(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
 def test_a_material_reflects_as_in_the_estimate(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = ball()
     material = material_of_ball(mask)
-    html = result_page(REPORT, normals, mask, values={"albedo": material[..., :3]}, material=material)
+    html = result_page(
+        REPORT, normals, mask, values={"albedo": material[..., :3]}, material=material
+    )
     tensor = torch.from_numpy(material[mask])
     base, (roughness, metal, specular) = tensor[:, :3], tensor[:, 3:6, None].unbind(1)
     lights = ((0.5, 0.4), (-0.6, -0.6))
-    pictures = views(open_page, html, [f"light={x},{y}&exposure=-1" for x, y in lights], webgl=webgl)
+    pictures = views(
+        open_page, html, [f"light={x},{y}&exposure=-1" for x, y in lights], webgl=webgl
+    )
     for (x, y), seen in zip(lights, pictures, strict=True):
         light = torch.from_numpy(light_at(x, y)[None].astype(np.float32))
         geometry = Geometry.of(torch.from_numpy(normals[mask]), light, torch.zeros(len(tensor)))
@@ -271,7 +338,8 @@ def test_a_material_reflects_as_in_the_estimate(open_page: OpenPage, webgl: bool
         painted = base * diffuse_lobe(geometry, torch.ones(1, 1)) + 0.08 * specular * facets
         expected = np.zeros((SIDE, SIDE, 3))
         expected[mask] = encode_srgb(0.5 * torch.lerp(painted, base * facets, metal).numpy())
-        inner = mask & (normals[..., 2] > 0.2)  # at the outline, 13 bits of a normal are too few for a sharp highlight
+        # at the outline, 13 bits of a normal are too few for a sharp highlight
+        inner = mask & (normals[..., 2] > 0.2)
         assert np.abs(seen - expected)[inner].max() <= 3
     assert pictures[0][mask].max() == 255  # the highlight of the metal
 
@@ -294,19 +362,32 @@ RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)
 
 def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
     """It contains them, also after the results have moved, and leaves out what cannot be read."""
-    for name, content in (("a & b", cv2.imencode(".png", np.tile(RED, (100, 100, 1)))[1]), ("cut", b"\x89PNG")):
+    for name, content in (
+        ("a & b", cv2.imencode(".png", np.tile(RED, (100, 100, 1)))[1]),
+        ("cut", b"\x89PNG"),
+    ):
         (tmp_path / name).mkdir()
         (tmp_path / name / "normals.png").write_bytes(bytes(content))
     report = {
-        "capture": "a & b", "n_lights": 10, "n_pixels": 48, "angular_error_deg": {"mean": 2.5},
-        "expected_under_5": 0.9, "warnings": [{"code": "c", "text": "It is <dark>."}], "seconds": {"read": 1.0},
+        "capture": "a & b",
+        "n_lights": 10,
+        "n_pixels": 48,
+        "angular_error_deg": {"mean": 2.5},
+        "expected_under_5": 0.9,
+        "warnings": [{"code": "c", "text": "It is <dark>."}],
+        "seconds": {"read": 1.0},
         "files": ["normals.png", "report.json"],
-    }  # fmt: skip
+    }
     failed = {"capture": "x" * 200, "error": "y" * 200}
-    html = index_page([Entry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path)
+    html = index_page(
+        [Entry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path
+    )
     (tmp_path / "a & b/normals.png").unlink()
     page = open_page(html, width=400)
-    assert page.locator("img").evaluate("image => [image.naturalWidth, image.naturalHeight]") == [256, 192]
+    assert page.locator("img").evaluate("image => [image.naturalWidth, image.naturalHeight]") == [
+        256,
+        192,
+    ]
     assert page.locator("td.words p").all_text_contents() == ["It is <dark>."] * 2
     picture = page.locator("img")
     picture.scroll_into_view_if_needed()
@@ -318,10 +399,17 @@ def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
 
 def test_the_report_fits_a_narrow_screen(open_page: OpenPage):
     png = cv2.imencode(".png", np.repeat(RED, 50, axis=1))[1].tobytes()
-    results = tuple(Result(m, c, 10, (5.0, 5.5, 6.0), 0.1) for m in ("ls", "iw12") for c in ("x" * 60, "y" * 60))
-    page = open_page(html_report([Evaluation(Protocol(10, 3), results, ())], [("figure", png)], []), width=400)
+    results = tuple(
+        Result(m, c, 10, (5.0, 5.5, 6.0), 0.1) for m in ("ls", "iw12") for c in ("x" * 60, "y" * 60)
+    )
+    page = open_page(
+        html_report([Evaluation(Protocol(10, 3), results, ())], [("figure", png)], []), width=400
+    )
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
-    assert page.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") == 400
+    assert (
+        page.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)")
+        == 400
+    )
 
 
 def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_path: Path) -> None:

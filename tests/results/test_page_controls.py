@@ -13,11 +13,15 @@ from splinecli.results.pages import result_page
 
 def wait_until(page: Any, condition: str) -> None:
     """Wait in the page; its policy refuses the polling of Playwright."""
-    page.evaluate(f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}")
+    page.evaluate(
+        f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}"
+    )
 
 
 def lights_are(page: Any, x: float, y: float, note: str) -> None:
-    np.testing.assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
+    np.testing.assert_allclose(
+        page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note
+    )
 
 
 @pytest.mark.parametrize("webgl", [True, False])
@@ -25,7 +29,9 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     values = {"albedo": normals + 1, "confidence": mask.astype(np.float32)}
-    html = result_page(report, normals, mask, values=values, error_map_deg=np.where(mask, np.float32(3), np.nan))
+    html = result_page(
+        report, normals, mask, values=values, error_map_deg=np.where(mask, np.float32(3), np.nan)
+    )
     page = open_page(html, width=400, height=800, webgl=webgl)
     page.evaluate("splinecli.ready")
     canvas = page.locator("#view")
@@ -63,11 +69,14 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     wait_until(page, "splinecli.region[2] < 200")
     left, top, width, height = page.evaluate("splinecli.region")
     np.testing.assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
-    # The picture follows the drag, an eighth of the view to the left and a quarter up; the light stays.
+    # The picture follows the drag, an eighth of the view to the left and a quarter up; the light
+    # stays.
     page.mouse.down()
     page.mouse.move(*at(-0.75, 0.5), steps=3)
     page.mouse.up()
-    np.testing.assert_allclose(page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2)
+    np.testing.assert_allclose(
+        page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2
+    )
     lights_are(page, 0.3, 0.3, "dragged")
     page.keyboard.press("Shift+ArrowLeft")
     np.testing.assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
@@ -109,14 +118,17 @@ def test_fingers(open_page: OpenPage) -> None:
     touch("touchMove", (0.3, 0.4), (0.7, 0.4))
     wait_until(page, "splinecli.region[2] < 200")
     assert page.evaluate("splinecli.light") == lights
-    # The fingers are twice as far apart, and what was between them, the middle, is a tenth of the view higher.
+    # The fingers are twice as far apart, and what was between them, the middle, is a tenth of the
+    # view higher.
     np.testing.assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
     touch("touchEnd")
 
 
 @pytest.mark.parametrize("millimetres", [None, 0.25])
 def test_the_ruler_has_the_unit_of_the_surface(open_page, monkeypatch, millimetres):
-    """A line over half the width of a reduced map is 128 pixels of the whole map, also where the view is zoomed."""
+    """A line over half the width of a reduced map is 128 pixels of the whole map, also where the
+    view is zoomed.
+    """
     monkeypatch.setattr(page_module, "LARGEST_MAP", (SIDE // 2) ** 2)
     report = {**REPORT, "surface": {"pixel_size_mm": millimetres}}
     page = open_page(result_page(report, *ball()), width=400, height=800)

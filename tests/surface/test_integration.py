@@ -42,7 +42,9 @@ def normals_of_slopes(along_x: Floats, along_y: Floats) -> Floats:
 
 
 def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats, Mask, Floats]:
-    """Return normals, mask and heights of the cap within `reach` of the radius, not centred on a pixel."""
+    """Return normals, mask and heights of the cap within `reach` of the radius, not centred on a
+    pixel.
+    """
     x, y = grid(height, width)
     x, y = x + 0.3, y - 0.2
     mask = x**2 + y**2 < (reach * radius) ** 2
@@ -51,7 +53,9 @@ def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats
 
 
 def bumps(height: int, width: int, seed: int = 0, *, usable: bool = False) -> Floats:
-    """Return normals that no surface has: smooth with noise, some nearly grazing, some facing away unless `usable`."""
+    """Return normals that no surface has: smooth with noise, some nearly grazing, some facing away
+    unless `usable`.
+    """
     rng = np.random.default_rng(seed)
     x, y = grid(height, width)
     normals = normals_of_slopes(np.sin(x / 3) + y / height, np.cos(y / 2))
@@ -90,11 +94,13 @@ def test_sphere(reach: float, limit: float, discontinuity: float) -> None:
     assert found[mask].mean() == pytest.approx(0, abs=1e-9)
 
 
-def levels(rows: int, columns: int, height: float, slope: float, joined: int) -> tuple[Floats, Floats, Mask]:
+def levels(
+    rows: int, columns: int, height: float, slope: float, joined: int
+) -> tuple[Floats, Floats, Mask]:
     """Return normals and heights of two flat levels, and the mask of the wall between them.
 
-    In the first `joined` rows, a ramp connects the levels. The wall is one pixel thick and faces the lower level,
-    nearly at a right angle to the view.
+    In the first `joined` rows, a ramp connects the levels. The wall is one pixel thick and faces
+    the lower level, nearly at a right angle to the view.
     """
     x, _ = grid(rows, columns)
     x = np.ceil(x)
@@ -137,7 +143,9 @@ def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> 
 
 
 def seen(camera: Floats, height: int, width: int) -> Floats:
-    """Return the points (H, W, 3) at depth 1 that the pixels show, by hand, for a camera without skew."""
+    """Return the points (H, W, 3) at depth 1 that the pixels show, by hand, for a camera without
+    skew.
+    """
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     x, down = (columns - camera[0, 2]) / camera[0, 0], (rows - camera[1, 2]) / camera[1, 1]
     return np.stack((x, -down, -np.ones_like(x)), axis=-1)
@@ -155,7 +163,9 @@ def test_perspective_plane() -> None:
     assert error_share(found, depth, mask) < 5e-4
     np.testing.assert_allclose(found, depth, rtol=1e-3)
     # A prior gives depths their scale.
-    np.testing.assert_allclose(integrate_normals(normals, mask, CAMERA, prior=500 * depth), 500 * depth, rtol=1e-3)
+    np.testing.assert_allclose(
+        integrate_normals(normals, mask, CAMERA, prior=500 * depth), 500 * depth, rtol=1e-3
+    )
 
 
 @pytest.mark.usefixtures("any_scale")
@@ -176,7 +186,8 @@ def test_perspective_sphere() -> None:
 
 
 def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
-    """Return matrices (P, P) and constants (P,) of facing * (h' - h) + slant to the right, left, bottom and top.
+    """Return matrices (P, P) and constants (P,) of facing * (h' - h) + slant to the right, left,
+    bottom and top.
 
     Equations without a neighbour, and those of normals at 87 degrees and more, are zero.
     """
@@ -204,11 +215,17 @@ def dense(normals: Floats, mask: Mask, discontinuity: float, iterations: int) ->
         weights = []
         for forth, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
             gaps = (matrices[back] @ heights) ** 2 - (matrices[forth] @ heights) ** 2
-            residuals = [np.abs(matrices[side] @ heights + constants[side]) for side in (forth, back)]
+            residuals = [
+                np.abs(matrices[side] @ heights + constants[side]) for side in (forth, back)
+            ]
             share = 1 / (1 + np.exp(-discontinuity * (iteration > 0) * gaps)) - 0.5
-            weights.append(0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2))))
+            weights.append(
+                0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2)))
+            )
         root = np.sqrt(np.concatenate(weights))
-        heights = np.linalg.lstsq(root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants))[0]
+        heights = np.linalg.lstsq(
+            root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants)
+        )[0]
     return heights
 
 
@@ -227,7 +244,9 @@ def test_a_prior_is_the_dense_solution() -> None:
     known = np.isfinite(prior[mask])
     pulls = 2 * np.pi / 8 * np.eye(len(known))[known]
     rows = np.concatenate((*(np.sqrt(0.5) * matrix for matrix in matrices), pulls))
-    values = np.concatenate((-np.sqrt(0.5) * np.concatenate(constants), 2 * np.pi / 8 * prior[mask][known]))
+    values = np.concatenate(
+        (-np.sqrt(0.5) * np.concatenate(constants), 2 * np.pi / 8 * prior[mask][known])
+    )
     expected = np.linalg.lstsq(rows, values)[0]
     parts = label(mask)[0][mask]
     reached = np.isin(parts, parts[known])
@@ -237,14 +256,18 @@ def test_a_prior_is_the_dense_solution() -> None:
 
 
 def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
-    """Return normals with smooth errors of 4 degrees and noise of 2, heights, and a coarse, noisy scan of these."""
+    """Return normals with smooth errors of 4 degrees and noise of 2, heights, and a coarse, noisy
+    scan of these.
+    """
     rng = np.random.default_rng(seed)
     x, y = grid(200, 200)
     heights = 40 * np.exp(-(x**2 + y**2) / 60**2) + 2 * np.sin(x / 5) * np.cos(y / 4)
     down, right = np.gradient(heights)
     normals = normals_of_slopes(right, -down)
     errors = np.stack([gaussian_filter(rng.normal(size=x.shape), 40) for _ in range(2)], axis=-1)
-    normals[..., :2] += errors * np.tan(np.radians(4)) / errors.std() + rng.normal(scale=0.035, size=errors.shape)
+    normals[..., :2] += errors * np.tan(np.radians(4)) / errors.std() + rng.normal(
+        scale=0.035, size=errors.shape
+    )
     scan = gaussian_filter(heights, 6) + rng.normal(scale=0.7, size=x.shape)
     return unit(normals), heights, scan
 
@@ -259,7 +282,11 @@ def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> 
         return float(np.nanstd(found - heights))
 
     both = integrate_normals(normals, discontinuity=discontinuity, prior=scan)
-    assert 1.5 * error(both) < error(scan) < error(integrate_normals(normals, discontinuity=discontinuity))
+    assert (
+        1.5 * error(both)
+        < error(scan)
+        < error(integrate_normals(normals, discontinuity=discontinuity))
+    )
     assert abs(np.mean(both - heights)) < 0.1
 
 
@@ -287,7 +314,11 @@ def test_bilateral_is_the_dense_solution() -> None:
 def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
     normals, mask = bumps(12, 17), holes(12, 17)
     middle = 0.0 if camera is None else 1.0
-    for some in (normals, np.broadcast_to((1.0, 0, 0), normals.shape), np.broadcast_to((0, 0.6, -0.8), normals.shape)):
+    for some in (
+        normals,
+        np.broadcast_to((1.0, 0, 0), normals.shape),
+        np.broadcast_to((0, 0.6, -0.8), normals.shape),
+    ):
         found = integrate_normals(some, mask, camera_matrix=camera)
         assert np.isfinite(found[mask]).all()
         assert found[3, 4] == pytest.approx(middle, abs=1e-9)
@@ -334,11 +365,31 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS * 0,), {}, InputError, "the normal map has no normal"),
         ((NORMALS[..., :2], MASK), {}, UsageError, "(3, 4, 2), expected (3, 4, 3) for this mask"),
         ((NORMALS, MASK.T), {}, UsageError, "(3, 4, 3), expected (4, 3, 3) for this mask"),
-        ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)"),
+        (
+            (NORMALS, MASK.astype(np.uint8)),
+            {},
+            UsageError,
+            "the mask is uint8 (3, 4), expected bool (H, W)",
+        ),
         ((NORMALS, ~MASK), {}, InputError, "the mask is empty"),
-        ((ZERO_AT_1_2, MASK), {}, InputError, "1 of 12 normals in the mask are not unit vectors, the first in row 1"),
-        ((NORMALS * np.nan, MASK), {}, InputError, "12 of 12 normals in the mask are not unit vectors"),
-        ((NORMALS, MASK, np.eye(4)), {}, UsageError, "the camera matrix has shape (4, 4), expected (3, 3)"),
+        (
+            (ZERO_AT_1_2, MASK),
+            {},
+            InputError,
+            "1 of 12 normals in the mask are not unit vectors, the first in row 1",
+        ),
+        (
+            (NORMALS * np.nan, MASK),
+            {},
+            InputError,
+            "12 of 12 normals in the mask are not unit vectors",
+        ),
+        (
+            (NORMALS, MASK, np.eye(4)),
+            {},
+            UsageError,
+            "the camera matrix has shape (4, 4), expected (3, 3)",
+        ),
         ((NORMALS, MASK, np.diag([9.0, 0, 1])), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA + 1e308), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA.T), {}, InputError, "is not a camera matrix"),
@@ -351,10 +402,14 @@ def test_bad_input(arguments, options, error, message):
 
 
 def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> None:
-    """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 % of the pairs."""
+    """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 %
+    of the pairs.
+    """
     x, y = grid(160, 160)
     truth = 20 * np.sin(x / 8) * np.cos(y / 12)
-    normals = normals_of_slopes(2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12))
+    normals = normals_of_slopes(
+        2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12)
+    )
     errors = gaussian_filter(np.random.default_rng(2).normal(size=normals.shape), (2, 2, 0))
     noisy = unit(normals + np.radians(8) * errors / errors.std())
     torn = {}
@@ -364,7 +419,9 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> No
     assert torn[0] < torn[2] < 0.0125
 
 
-@pytest.mark.parametrize(("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))])
+@pytest.mark.parametrize(
+    ("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))]
+)
 def test_of_a_wave_the_stated_share_is_kept(wave: int, kept: float) -> None:
     x = np.broadcast_to(np.arange(512), (96, 512))
     k = 2 * np.pi / wave

@@ -19,19 +19,25 @@ MASK = np.ones((60, 80), np.bool_)
 
 
 def plate(slopes: tuple[float, float] = SLOPES, aspect: float = 1.0) -> tuple[Floats, Floats]:
-    """Return heights (60, 80) and normals of a plate with a bump on a fifth of it; pixels are `aspect` high."""
+    """Return heights (60, 80) and normals of a plate with a bump on a fifth of it; pixels are
+    `aspect` high.
+    """
     rows, columns = np.indices(MASK.shape)
     x, y = columns - 20.0, -(rows - 30.0) * aspect
     inside = np.hypot(x, y) < 15
     bump = np.where(inside, (225 - x**2 - y**2) / 60, 0)
     heights = bump + slopes[0] * columns - slopes[1] * aspect * rows
-    right, up = (np.where(inside, -axis / 30, 0) + slope for axis, slope in zip((x, y), slopes, strict=True))
+    right, up = (
+        np.where(inside, -axis / 30, 0) + slope for axis, slope in zip((x, y), slopes, strict=True)
+    )
     return heights, unit(np.stack((-right, -up, np.ones_like(right)), axis=-1))
 
 
 @pytest.mark.parametrize("points", [(), ((60, 5), (75, 50), (50, 30))], ids=["plane", "points"])
 @pytest.mark.parametrize("aspect", [1.0, 2.5])
-def test_the_slope_of_the_plate_is_removed(points: tuple[tuple[int, int], ...], aspect: float) -> None:
+def test_the_slope_of_the_plate_is_removed(
+    points: tuple[tuple[int, int], ...], aspect: float
+) -> None:
     heights, normals = plate(aspect=aspect)
     slopes = plane_slopes(heights, points, aspect=aspect)
     assert slopes == pytest.approx(SLOPES, abs=0.003)
@@ -43,21 +49,32 @@ def test_the_slope_of_the_plate_is_removed(points: tuple[tuple[int, int], ...], 
 def test_integrate_levels_depth_and_normals(tmp_path: Path) -> None:
     np.save(tmp_path / "n.npy", plate(aspect=2.0)[1].astype(np.float32))
     options = IntegrateOptions(
-        normals=tmp_path / "n.npy", level=(), pixel_aspect=2.0, pixel_size=0.5, formats=("npy", "ply")
+        normals=tmp_path / "n.npy",
+        level=(),
+        pixel_aspect=2.0,
+        pixel_size=0.5,
+        formats=("npy", "ply"),
     )
     report = integrate_normal_map(options)
     assert json.loads(json.dumps(report)) == json.loads((tmp_path / "surface.json").read_text())
-    assert report["level"]["tilt_deg"] == pytest.approx(np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3)
+    assert report["level"]["tilt_deg"] == pytest.approx(
+        np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3
+    )
     assert {"level_normals.npy", "level_normals.png"} <= set(report["files"])
     depth = np.load(tmp_path / "depth.npy")
     true = 0.5 * plate((0.0, 0.0), 2.0)[0]
-    assert np.abs(depth - depth[:, 60:].mean() - true).max() < 0.3  # mm; the rim of the bump is a crease
+    # mm; the rim of the bump is a crease
+    assert np.abs(depth - depth[:, 60:].mean() - true).max() < 0.3
     flat = np.load(tmp_path / "level_normals.npy")[:, 50:]
     assert angle_between_deg(flat, np.broadcast_to((0.0, 0.0, 1.0), flat.shape)).max() < 0.3
 
 
 def test_levels_are_parsed() -> None:
-    assert parse_level("plane") == () and parse_level("1,2 30,4  5,60") == ((1, 2), (30, 4), (5, 60))
+    assert parse_level("plane") == () and parse_level("1,2 30,4  5,60") == (
+        (1, 2),
+        (30, 4),
+        (5, 60),
+    )
     for text in ("1,2 3,4", "flat", "1,2 3,4 5"):
         with pytest.raises(UsageError, match="three points"):
             parse_level(text)
@@ -76,5 +93,7 @@ def test_a_camera_matrix_contradicts_levelling(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "camera.txt", [[100, 0, 40], [0, 100, 30], [0, 0, 1]])
     with pytest.raises(UsageError, match="orthographic"):
         integrate_normal_map(
-            IntegrateOptions(normals=tmp_path / "n.npy", camera_matrix=tmp_path / "camera.txt", level=())
+            IntegrateOptions(
+                normals=tmp_path / "n.npy", camera_matrix=tmp_path / "camera.txt", level=()
+            )
         )

@@ -1,4 +1,6 @@
-"""Meshes of height maps, from blocks of pixels or decimated: relit as viewers do, they have the measured normals."""
+"""Meshes of height maps, from blocks of pixels or decimated: relit as viewers do, they have the
+measured normals.
+"""
 
 from typing import Any
 
@@ -33,9 +35,14 @@ def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
 def test_four_pixels() -> None:
     depth = np.array([[5.0, 0.0], [1.0, 4.0]])
     mesh = surface_mesh(depth, np.ones((2, 2), bool))
-    np.testing.assert_array_equal(mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]])
+    np.testing.assert_array_equal(
+        mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]]
+    )
     # The edge between pixels 0 and 3, which are nearly as high.
-    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {frozenset({0, 2, 3}), frozenset({0, 3, 1})}
+    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
+        frozenset({0, 2, 3}),
+        frozenset({0, 3, 1}),
+    }
     assert (mesh.vertices.dtype, mesh.triangles.dtype, mesh.colours) == (np.float32, np.int32, None)
 
 
@@ -46,7 +53,9 @@ def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) ->
     # Seen along z, half a pixel each, counter-clockwise.
     np.testing.assert_allclose(face_normals(mesh)[:, 2], 1)
     corners = mask[1:, 1:] * 1 + mask[:-1, 1:] + mask[1:, :-1] + mask[:-1, :-1]
-    assert len(mesh.triangles) == 2 * np.count_nonzero(corners == 4) + np.count_nonzero(corners == 3)
+    assert len(mesh.triangles) == 2 * np.count_nonzero(corners == 4) + np.count_nonzero(
+        corners == 3
+    )
     assert len({frozenset(triangle) for triangle in mesh.triangles.tolist()}) == len(mesh.triangles)
 
 
@@ -70,7 +79,11 @@ def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
     depth = height if camera is None else 7 * np.exp(-height / np.sqrt(11_000))
     mask = np.ones(depth.shape, bool)
     whole = surface_mesh(depth, mask, camera)
-    assert len(surface_mesh(depth, mask, camera, largest_step=10.01).triangles) == len(whole.triangles) == 80
+    assert (
+        len(surface_mesh(depth, mask, camera, largest_step=10.01).triangles)
+        == len(whole.triangles)
+        == 80
+    )
     cut = surface_mesh(depth, mask, camera, largest_step=9.99)
     assert len(cut.triangles) == 70
     assert (np.ptp(cut.vertices[cut.triangles, 2], axis=1) < 1e-5).all()
@@ -97,13 +110,17 @@ def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
     expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
     np.testing.assert_allclose(mesh.uvs, expected, atol=1e-6)
     # Outside the mask, the texture goes on with the colours of the border.
-    assert {tuple(colour) for colour in mesh.texture.reshape(-1, 3)} == {tuple(c) for c in colours[mask]}
+    assert {tuple(colour) for colour in mesh.texture.reshape(-1, 3)} == {
+        tuple(c) for c in colours[mask]
+    }
 
 
 def test_normals_of_the_triangles() -> None:
     mesh = surface_mesh(0.5 * COLUMNS - 2.0 * ROWS, np.ones((15, 20), bool))
     slope = np.array((-0.5, -2, 1))
-    np.testing.assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6
+    )
 
 
 RNG = np.random.default_rng(0)
@@ -135,7 +152,9 @@ Floats = NDArray[np.float64]
 
 
 def measured(columns: Floats, rows: Floats) -> Floats:
-    """Return the normals (..., 3) of a dome with relief that is finer than the triangles will be."""
+    """Return the normals (..., 3) of a dome with relief that is finer than the triangles will
+    be.
+    """
     across, up = (columns - 44.5) / 60, (44.5 - rows) / 60
     x = across + 0.35 * np.sin(columns / 2.5) * np.cos(rows / 4)
     y = up + 0.35 * np.cos(columns / 3) * np.sin(rows / 2)
@@ -146,8 +165,12 @@ def height_of_dome(columns: Floats, rows: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
 
 
-def dome(camera: NDArray[np.float64] | None, odd: int = 0) -> tuple[tuple[Any, ...], NDArray[np.float64]]:
-    """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the relief."""
+def dome(
+    camera: NDArray[np.float64] | None, odd: int = 0
+) -> tuple[tuple[Any, ...], NDArray[np.float64]]:
+    """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the
+    relief.
+    """
     rows, columns = np.mgrid[: SIDE + odd, :SIDE].astype(float)
     mask = np.hypot(columns - 44.5, rows - 44.5) < 42
     height = height_of_dome(columns, rows)
@@ -156,7 +179,9 @@ def dome(camera: NDArray[np.float64] | None, odd: int = 0) -> tuple[tuple[Any, .
     return (depth, mask, camera, np.full((*mask.shape, 3), 90, np.uint8)), normal_map
 
 
-@pytest.fixture(scope="module", params=[None, CAMERA_OF_SPHERE], ids=["orthographic", "perspective"])
+@pytest.fixture(
+    scope="module", params=[None, CAMERA_OF_SPHERE], ids=["orthographic", "perspective"]
+)
 def camera(request: pytest.FixtureRequest) -> Any:
     return request.param
 
@@ -164,7 +189,9 @@ def camera(request: pytest.FixtureRequest) -> Any:
 @pytest.fixture(scope="module")
 def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
     surface, normal_map = dome(camera)
-    return decimated_mesh(*surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map)
+    return decimated_mesh(
+        *surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map
+    )
 
 
 def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
@@ -176,7 +203,9 @@ def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     # Ten points in each triangle.
     weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))
     uv, smooth, tangent = (
-        np.einsum("ktc,tcx->ktx", weights, arrays[name][arrays["indices"]]).reshape(-1, arrays[name].shape[1])
+        np.einsum("ktc,tcx->ktx", weights, arrays[name][arrays["indices"]]).reshape(
+            -1, arrays[name].shape[1]
+        )
         for name in ("TEXCOORD_0", "NORMAL", "TANGENT")
     )
     columns, rows = (uv * SIDE - 0.5).T
@@ -185,15 +214,24 @@ def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     columns, rows = np.rint(columns), np.rint(rows)
     texels = arrays["normal"][rows.astype(int), columns.astype(int)] / 255 * 2 - 1
     smooth, side = unit(smooth), unit(tangent[:, :3])
-    lit = unit(np.einsum("px,pxy->py", texels, np.stack((side, np.cross(smooth, side), smooth), axis=1)))
-    errors, without = (angle_between_deg(found, measured(columns, rows))[inside] for found in (lit, smooth))
-    # 8 bits are accurate to 0.3 degrees; half a texel is up to 4 degrees on the dome, and less on average.
+    lit = unit(
+        np.einsum("px,pxy->py", texels, np.stack((side, np.cross(smooth, side), smooth), axis=1))
+    )
+    errors, without = (
+        angle_between_deg(found, measured(columns, rows))[inside] for found in (lit, smooth)
+    )
+    # 8 bits are accurate to 0.3 degrees; half a texel is up to 4 degrees on the dome, and less on
+    # average.
     assert errors.mean() < 1.0
     assert without.mean() > 10
 
 
-def test_tangents_are_those_that_viewers_compute(decimated: SurfaceMesh, camera: NDArray[np.float64] | None) -> None:
-    """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a vertex."""
+def test_tangents_are_those_that_viewers_compute(
+    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
+) -> None:
+    """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a
+    vertex.
+    """
     corners = decimated.vertices[decimated.triangles].astype(float)
     uvs = decimated.uvs[decimated.triangles].astype(float)
     edges, steps = corners[:, 1:] - corners[:, :1], uvs[:, 1:] - uvs[:, :1]
@@ -224,7 +262,9 @@ def test_vertices_stay_on_the_dome_and_in_their_places(decimated, camera):
 
 @pytest.mark.parametrize("odd", [0, 1])
 def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
-    """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their places."""
+    """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their
+    places.
+    """
     monkeypatch.setattr(mesh_module, "LARGE_MAP", 0)
     surface, normal_map = dome(camera, odd)
     mask = surface[1]

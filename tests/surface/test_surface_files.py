@@ -27,12 +27,16 @@ def wave(coloured: bool = True, mask: NDArray[np.bool_] | None = None) -> Surfac
     return surface_mesh(DEPTH, mask, colours=COLOURS if coloured else None)
 
 
-def encode(mesh: SurfaceMesh, form: str, *, unit: str = "pixel", millimetres: float = 1.0) -> dict[str, bytes]:
+def encode(
+    mesh: SurfaceMesh, form: str, *, unit: str = "pixel", millimetres: float = 1.0
+) -> dict[str, bytes]:
     return dict(encode_surface(Surface(DEPTH, mesh, unit, millimetres), [form]))
 
 
 def load(content: bytes, form: str) -> Any:
-    return trimesh.load_mesh(io.BytesIO(content), file_type=form, process=False, maintain_order=True)
+    return trimesh.load_mesh(
+        io.BytesIO(content), file_type=form, process=False, maintain_order=True
+    )
 
 
 @pytest.mark.parametrize("coloured", [False, True])
@@ -66,7 +70,11 @@ def test_obj(coloured: bool, tmp_path: Path) -> None:
     read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
     np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.triangles)
-    normals = [line.split()[1:] for line in files["mesh.obj"].decode().splitlines() if line.startswith("vn ")]
+    normals = [
+        line.split()[1:]
+        for line in files["mesh.obj"].decode().splitlines()
+        if line.startswith("vn ")
+    ]
     np.testing.assert_allclose(np.array(normals, float), mesh.normals, atol=1e-6)
     np.testing.assert_allclose(read.visual.uv, mesh.uvs * (1, -1) + (0, 1), atol=1e-6)
     if coloured:
@@ -84,7 +92,11 @@ def test_glb(coloured: bool) -> None:
     np.testing.assert_allclose(arrays["TEXCOORD_0"], mesh.uvs, atol=1e-6)
     [material] = tree["materials"]
     matte = material["pbrMetallicRoughness"]
-    assert (matte["metallicFactor"], matte["roughnessFactor"], material["doubleSided"]) == (0, 1, True)
+    assert (matte["metallicFactor"], matte["roughnessFactor"], material["doubleSided"]) == (
+        0,
+        1,
+        True,
+    )
     assert ("TANGENT" in arrays, "normal" in arrays) == (False, False)  # the normals are exact
     if coloured:
         np.testing.assert_array_equal(arrays["colour"], COLOURS)
@@ -96,39 +108,55 @@ def test_glb(coloured: bool) -> None:
 
 def glossy(specular: NDArray[np.floating]) -> SurfaceMesh:
     gloss = np.dstack((np.full(SHAPE, 255), np.full(SHAPE, 102), np.zeros(SHAPE))).astype(np.uint8)
-    return replace(wave(), gloss=gloss, specular=np.broadcast_to(specular, SHAPE).astype(np.float32))
+    return replace(
+        wave(), gloss=gloss, specular=np.broadcast_to(specular, SHAPE).astype(np.float32)
+    )
 
 
 def test_reflectance_of_glb() -> None:
-    """KHR_materials_specular has 0.04 times its colour as reflectance, and trimesh reads the rest as before."""
+    """KHR_materials_specular has 0.04 times its colour as reflectance, and trimesh reads the rest
+    as before.
+    """
     specular = np.linspace(0.1, 1.6, SHAPE[1])  # 0.8 % to 12.8 %
     content = encode(glossy(specular), "glb")["mesh.glb"]
     tree, arrays = read_glb(content)
     extension = tree["materials"][0]["extensions"]["KHR_materials_specular"]
-    colour = decode_transfer(arrays["specular"].astype(np.float32) / 255, None) * extension["specularColorFactor"]
+    colour = (
+        decode_transfer(arrays["specular"].astype(np.float32) / 255, None)
+        * extension["specularColorFactor"]
+    )
     np.testing.assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
     np.testing.assert_array_equal(arrays["colour"], COLOURS)
     assert (arrays["gloss"] == (255, 102, 0)).all()
     [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     np.testing.assert_array_equal(np.asarray(read.visual.material.baseColorTexture), COLOURS)
     for usual in (None, np.float32(0.5)):
-        tree, _ = read_glb(encode(replace(glossy(np.float32(1)), specular=usual), "glb")["mesh.glb"])
+        tree, _ = read_glb(
+            encode(replace(glossy(np.float32(1)), specular=usual), "glb")["mesh.glb"]
+        )
         assert "extensions" not in tree["materials"][0]
     tree, arrays = read_glb(encode(glossy(np.float32(0.25)), "glb")["mesh.glb"])
-    assert tree["materials"][0]["extensions"]["KHR_materials_specular"] == {"specularColorFactor": [0.5] * 3}
+    assert tree["materials"][0]["extensions"]["KHR_materials_specular"] == {
+        "specularColorFactor": [0.5] * 3
+    }
 
 
 def test_gloss_of_obj(tmp_path: Path) -> None:
     files = encode(glossy(np.float32(0.5)), "obj")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    lines = dict(line.split(maxsplit=1) for line in files["mesh.mtl"].decode().splitlines() if " " in line)
+    lines = dict(
+        line.split(maxsplit=1) for line in files["mesh.mtl"].decode().splitlines() if " " in line
+    )
     assert {key: lines[key] for key in ("map_Kd", "map_Pr", "map_Pm")} == {
-        "map_Kd": "mesh.png", "map_Pr": "mesh_roughness.png", "map_Pm": "mesh_metalness.png"
-    }  # fmt: skip
+        "map_Kd": "mesh.png",
+        "map_Pr": "mesh_roughness.png",
+        "map_Pm": "mesh_metalness.png",
+    }
     assert (np.asarray(Image.open(tmp_path / "mesh_roughness.png")) == 102).all()
     assert not np.asarray(Image.open(tmp_path / "mesh_metalness.png")).any()
-    # At a roughness of 0.4, facets of 4 % reflect 0.04 / (4 x 0.4^4) of a white matte surface in the mirror direction.
+    # At a roughness of 0.4, facets of 4 % reflect 0.04 / (4 x 0.4^4) of a white matte surface in
+    # the mirror direction.
     assert float(lines["Ks"].split()[0]) == pytest.approx(0.04 / (4 * 0.4**4), abs=0.003)
     assert float(lines["Ns"]) == pytest.approx(2 / 0.4**4 - 2)
     read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)

@@ -8,7 +8,13 @@ import torch
 
 from splinecli.errors import UsageError
 from splinecli.system import machine
-from splinecli.system.machine import available_memory, cgroup_quotas, choose_device, choose_precision, import_extra
+from splinecli.system.machine import (
+    available_memory,
+    cgroup_quotas,
+    choose_device,
+    choose_precision,
+    import_extra,
+)
 
 
 @pytest.mark.parametrize(
@@ -21,9 +27,12 @@ def test_choice(monkeypatch: pytest.MonkeyPatch, name: str, available: bool, cho
 
 
 @pytest.mark.parametrize(
-    ("name", "problem"), [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")]
+    ("name", "problem"),
+    [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")],
 )
-def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch, name: str, problem: str) -> None:
+def test_devices_that_are_not_there(
+    monkeypatch: pytest.MonkeyPatch, name: str, problem: str
+) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UsageError, match=problem):
         choose_device(name)
@@ -45,7 +54,9 @@ def write(path: Path, text: str) -> None:
 
 @pytest.fixture
 def mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of control groups, beside the file `groups` that says in which ones this process is."""
+    """The folder of control groups, beside the file `groups` that says in which ones this process
+    is.
+    """
     monkeypatch.setattr(machine, "_GROUPS", tmp_path / "groups")
     monkeypatch.setattr(machine, "_MOUNT", tmp_path / "mount")
     return tmp_path / "mount"
@@ -57,9 +68,17 @@ def enter(mount: Path, groups: str) -> None:
 
 V1 = "cpu,cpuacct"
 QUOTAS = {
-    "version 2": ("0::/jobs/ours\n", {"cpu.max": "max 1", "jobs/cpu.max": "3 1", "jobs/ours/cpu.max": "4 1"}, [3, 4]),
+    "version 2": (
+        "0::/jobs/ours\n",
+        {"cpu.max": "max 1", "jobs/cpu.max": "3 1", "jobs/ours/cpu.max": "4 1"},
+        [3, 4],
+    ),
     "the top": ("0::/\n", {"cpu.max": "max 100000\n", "jobs/cpu.max": "300000 100000\n"}, []),
-    "a container that shows the host's path": ("0::/docker/0123abcd\n", {"cpu.max": "150000 100000\n"}, [1.5]),
+    "a container that shows the host's path": (
+        "0::/docker/0123abcd\n",
+        {"cpu.max": "150000 100000\n"},
+        [1.5],
+    ),
     "version 1": (
         "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n",
         {f"{V1}/cpu.cfs_quota_us": "-1\n", f"{V1}/cpu.cfs_period_us": "100000\n"}
@@ -95,11 +114,17 @@ def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPa
     assert available_memory() == 5000 - 3000 + 500
 
 
-def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_left_in_control_groups_of_version_1(
+    mount: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(machine, "_free_memory", lambda: 8e9)
     monkeypatch.setattr(machine, "_left_in_address_space", lambda: 9e9)
     enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
-    for group, limit in (("", 9223372036854771712), ("box", 5000), ("box/ours", 9223372036854771712)):
+    for group, limit in (
+        ("", 9223372036854771712),
+        ("box", 5000),
+        ("box/ours", 9223372036854771712),
+    ):
         write(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
         write(mount / "memory" / group / "memory.usage_in_bytes", "3000\n")
     write(mount / "memory/box/memory.stat", "inactive_file 7\ntotal_inactive_file 500\n")
@@ -114,7 +139,9 @@ def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: py
 )
 def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
     monkeypatch.setattr(machine.os, "cpu_count", lambda: cores)
-    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+    monkeypatch.setattr(
+        machine.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False
+    )
     monkeypatch.setattr(machine, "cgroup_quotas", lambda: quotas)
     assert machine.count_available_cores() == expected
 

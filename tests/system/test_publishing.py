@@ -1,6 +1,8 @@
-"""Sets of files replace earlier ones, whenever the process is killed and whatever somebody put into the folder.
+"""Sets of files replace earlier ones, whenever the process is killed and whatever somebody put into
+the folder.
 
-Single files appear complete or not at all. One process at a time holds a folder, on systems with either kind of lock.
+Single files appear complete or not at all. One process at a time holds a folder, on systems with
+either kind of lock.
 """
 
 import errno
@@ -19,7 +21,15 @@ from kills import content, killed_at, missing_syncs, record_calls
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED, parse_json, write_bytes, write_text
-from splinecli.system.publishing import LOCK, UNDONE, BusyError, held_folder, locked, locked_file, new_files
+from splinecli.system.publishing import (
+    LOCK,
+    UNDONE,
+    BusyError,
+    held_folder,
+    locked,
+    locked_file,
+    new_files,
+)
 
 REPORT = "report.json"
 OLD = {REPORT: b"old", "a.txt": b"old a", "only old.txt": b"old", "pictures/1.png": b"old 1"}
@@ -43,7 +53,9 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path: Path, first: bool) -> None:
+def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(
+    tmp_path: Path, first: bool
+) -> None:
     reports, step = [], 0
     while True:
         folder = tmp_path / str(step)
@@ -65,12 +77,17 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path: Path
         publish(folder)
         assert content(folder) == NEW | MINE
         step += 1
-    # The earlier report, then none, then the new one, whose place in the folder is all that is left to sync.
-    assert reports == sorted(reports, key=[MINE.get(REPORT) if first else b"old", None, b"new"].index)
+    # The earlier report, then none, then the new one, whose place in the folder is all that is left
+    # to sync.
+    assert reports == sorted(
+        reports, key=[MINE.get(REPORT) if first else b"old", None, b"new"].index
+    )
     assert reports.count(None) > 5
 
 
-def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_names_the_file_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def save_half(file: IO[bytes], *_: object, **__: object) -> None:
         file.write(b"half")
         raise FULL
@@ -83,8 +100,12 @@ def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_between_renames_leaves_no_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At any rename, the last one included, it stays a KeyboardInterrupt, and no hidden file is left."""
+def test_ctrl_c_between_renames_leaves_no_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At any rename, the last one included, it stays a KeyboardInterrupt, and no hidden file is
+    left.
+    """
     replace, calls = Path.replace, []
 
     def interrupt(path: Path, target: Path) -> Path:
@@ -127,7 +148,9 @@ LINKS: dict[str, Callable[[Path, Path], None]] = {
 
 @pytest.mark.parametrize("kind", LINKS)
 @pytest.mark.parametrize("name", [REPORT, "a.txt", "only old.txt", "pictures/1.png"])
-def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(tmp_path: Path, kind: str, name: str) -> None:
+def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(
+    tmp_path: Path, kind: str, name: str
+) -> None:
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     write(elsewhere, {"precious": b"mine"})
     (folder / name).parent.mkdir(parents=True)
@@ -144,7 +167,9 @@ def test_a_link_in_the_place_of_a_subfolder_is_refused(tmp_path: Path) -> None:
     write(folder, {REPORT: b"old"})
     (folder / "pictures").symlink_to(elsewhere)
     for contents in (NEW, {REPORT: b"new"}):  # with a file to write there, or only one to remove
-        with pytest.raises(OutputError, match="pictures: found a link, expected a folder") as caught:
+        with pytest.raises(
+            OutputError, match="pictures: found a link, expected a folder"
+        ) as caught:
             publish(folder, contents)
         assert caught.value.exit_code == 5
     assert content(elsewhere) == {"1.png": b"mine"}
@@ -160,7 +185,11 @@ def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
 
 def test_what_a_killed_process_was_writing_goes(tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    mine = MINE | {".draft.unfinished/a": b"mine", ".b.unfinished": b"mine", f".mine{UNFINISHED}/a": b"mine"}
+    mine = MINE | {
+        ".draft.unfinished/a": b"mine",
+        ".b.unfinished": b"mine",
+        f".mine{UNFINISHED}/a": b"mine",
+    }
     write(folder, mine | {f".0123456789abcdef{UNFINISHED}": b"half"})
     write(tmp_path, {"elsewhere": b"mine"})
     link = folder / f".link{UNFINISHED}"
@@ -182,7 +211,9 @@ def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path: Path) -
     assert len(list(missing_syncs(without_syncs, REPORT))) > len(NEW)
 
 
-def test_the_names_of_new_folders_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_names_of_new_folders_are_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     synced: list[Path] = []
     monkeypatch.setattr("splinecli.system.files.sync", synced.append)
     files.write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
@@ -215,7 +246,9 @@ def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
     with (
         locked(tmp_path / "run"),
-        pytest.raises(BusyError, match="run: another splinecli process is writing into this folder"),
+        pytest.raises(
+            BusyError, match="run: another splinecli process is writing into this folder"
+        ),
         locked(tmp_path / "run"),
     ):
         pytest.fail("two at once")
@@ -255,8 +288,13 @@ def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path: Path) -> No
 
 def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / LOCK).touch()
-    monkeypatch.setattr(os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
-    message = r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise choose another -o"
+    monkeypatch.setattr(
+        os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    )
+    message = (
+        r"\.lock: this lock file belongs to another user.*remove the file\."
+        r" Otherwise choose another -o"
+    )
     with pytest.raises(OutputError, match=message), locked(tmp_path):
         pytest.fail("it has no lock")
     monkeypatch.undo()
@@ -276,11 +314,16 @@ def test_a_new_file_in_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
     assert names_in(path.parent) == ["out.txt"]
 
 
-def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_and_ctrl_c_leave_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "out.bin"
     write_bytes(path, b"old")
 
-    for failure, seen in ((OSError(28, "full"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)):
+    for failure, seen in (
+        (OSError(28, "full"), OutputError),
+        (KeyboardInterrupt(), KeyboardInterrupt),
+    ):
         monkeypatch.setattr(Path, "replace", Mock(side_effect=failure))
         with pytest.raises(seen):
             write_bytes(path, b"new")
@@ -289,7 +332,9 @@ def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: 
 
 
 def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splinecli.system.files.sync", Mock(side_effect=OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        "splinecli.system.files.sync", Mock(side_effect=OSError(28, "No space left on device"))
+    )
     with pytest.raises(OutputError, match="No space left"):
         write_bytes(tmp_path / "a" / "b" / "out.bin", b"content")
     assert names_in(tmp_path) == []

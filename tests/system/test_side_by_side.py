@@ -57,14 +57,18 @@ def test_a_new_thread_begins_with_one_thread_of_its_own(threads: int) -> None:
     openmp = ctypes.CDLL(None)
     if not hasattr(openmp, "omp_get_max_threads"):
         pytest.skip("PyTorch does not use a shared OpenMP here")
-    assert list(side_by_side(lambda _: openmp.omp_get_max_threads(), range(threads))) == [1] * threads
+    assert (
+        list(side_by_side(lambda _: openmp.omp_get_max_threads(), range(threads))) == [1] * threads
+    )
 
 
 def test_callers_in_several_threads_restore_the_number_in_each(threads: int) -> None:
     """The first one ends while the second one is within."""
     first_in, second_in, first_out = (threading.Event() for _ in range(3))
 
-    def call(begins: threading.Event | None, began: threading.Event, ends: threading.Event) -> tuple[int, int, int]:
+    def call(
+        begins: threading.Event | None, began: threading.Event, ends: threading.Event
+    ) -> tuple[int, int, int]:
         assert begins is None or begins.wait(60)
         with one_thread_each() as before:
             within = torch.get_num_threads()

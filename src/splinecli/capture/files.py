@@ -21,14 +21,31 @@ from splinecli.capture.formats.numbers import read_lines, read_text
 from splinecli.errors import InputError
 from splinecli.records.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
 from splinecli.records.output_files import FOUND_LIGHTS, PLOTS, own_files
-from splinecli.system.files import check_file, file_sha256, find_mode, is_found_file, is_substitution, reading, resolve
+from splinecli.system.files import (
+    check_file,
+    file_sha256,
+    find_mode,
+    is_found_file,
+    is_substitution,
+    reading,
+    resolve,
+)
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")  # treated as images only in a folder without others
+# treated as images only in a folder without others
+_RARE = (
+    ".pgm",
+    ".ppm",
+    ".webp",
+    ".avif",
+    ".heic",
+    ".heif",
+)
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
-IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)  # suffixes of images of an object
+# suffixes of images of an object
+IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
 
 
 class NoImagesError(InputError):
@@ -43,7 +60,8 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 
 
 def list_folder(folder: Path) -> list[Path]:
-    """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
+    """Return the folder's content in natural order, without hidden files (macOS writes "._"
+    companions of images).
 
     Raises InputError if the folder is missing, is a file, or cannot be read.
     """
@@ -53,7 +71,9 @@ def list_folder(folder: Path) -> list[Path]:
     if not stat.S_ISDIR(mode):
         raise InputError("found a file, expected a folder of images", path=folder)
     with reading(folder, "folder"):
-        return sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key)
+        return sorted(
+            (entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key
+        )
 
 
 def list_images(
@@ -61,9 +81,10 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
-    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and replaces it. A JPEG is
-    treated as a copy made by the camera or a viewer, and ignored. Also excluded are files with another role, either by
-    their lower-case stem, such as "mask", or because the user named them.
+    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and
+    replaces it. A JPEG is treated as a copy made by the camera or a viewer, and ignored. Also
+    excluded are files with another role, either by their lower-case stem, such as "mask", or
+    because the user named them.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -80,40 +101,58 @@ def list_images(
     for image in images:
         stem, own = image.stem.lower(), rank[image.suffix.lower()]
         best[stem] = min(own, best.get(stem, own))
-    return tuple(image for image in images if rank[image.suffix.lower()] == best[image.stem.lower()])
+    return tuple(
+        image for image in images if rank[image.suffix.lower()] == best[image.stem.lower()]
+    )
 
 
 def copies(images: Sequence[Path]) -> list[CaptureWarning]:
-    """Say which images were left out because another file of the same stem shows the same photograph."""
+    """Say which images were left out because another file of the same stem shows the same
+    photograph.
+    """
     images = [page_of(image)[0] for image in images]
     stems = {image.stem.lower() for image in images}
     others = [
         entry
         for folder in {image.parent for image in images}
         for entry in list_folder(folder)
-        if entry.suffix.lower() in IMAGE_SUFFIXES and entry.stem.lower() in stems and entry not in images
+        if entry.suffix.lower() in IMAGE_SUFFIXES
+        and entry.stem.lower() in stems
+        and entry not in images
     ]
     if not others:
         return []
-    kinds, used = (", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images))
-    text = f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the same photographs, and"
+    kinds, used = (
+        ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images)
+    )
+    text = (
+        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
+        " same photographs, and"
+    )
     return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError for an empty list of images."""
     if not images:
-        suffixes = Counter(path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir())
-        found = ", ".join(f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2)
+        suffixes = Counter(
+            path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir()
+        )
+        found = ", ".join(
+            f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2
+        )
         problem = "the folder contains no images" + (f", but {found}" if found else "")
-        hint = "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as images"
+        hint = (
+            "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as images"
+        )
         raise NoImagesError(problem, path=folder, hint=hint)
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
     """Return the images that a filenames.txt names, one on each line, relative to its folder.
 
-    Raises InputError with the line for an image that does not exist or is named twice; also for an empty list.
+    Raises InputError with the line for an image that does not exist or is named twice; also for an
+    empty list.
     """
     images: dict[Path, int] = {}
     for line, text in enumerate(read_lines(path), start=1):
@@ -121,16 +160,21 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         if not name:
             continue
         places = (path.parent / each / name for each in ("", *IMAGE_FOLDERS))
-        image = next(filter(os.path.exists, places), None)  # Path.exists raises for a name that is too long
+        # Path.exists raises for a name that is too long
+        image = next(filter(os.path.exists, places), None)
         if Path(name).is_absolute() or ".." in Path(name).parts:
             hint = "Copy the image into the folder, or set a link to it there, and name that"
-            raise InputError(f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint)
+            raise InputError(
+                f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint
+            )
         if image is None:
             hint = "Correct the name or remove the line"
             raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
         check_file(image, "an image")
         if image in images:
-            raise InputError(f'the image "{name}" is also on line {images[image]}', path=path, line=line)
+            raise InputError(
+                f'the image "{name}" is also on line {images[image]}', path=path, line=line
+            )
         images[image] = line
     if not images:
         raise InputError("the list names no images", path=path)
@@ -164,15 +208,16 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-# Names of subfolders with the images of a capture, whose other files are in the parent; the first is PSBox's.
+# Names of subfolders with the images of a capture, whose other files are in the parent; the first
+# is PSBox's.
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
     for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
     if Path(name).suffix in IMAGE_SUFFIXES
 )
-"""Lower-case stems of pictures in a capture's folder that are not images of the object under one light. The folder of
-results may be the same."""
+"""Lower-case stems of pictures in a capture's folder that are not images of the object under one
+light. The folder of results may be the same."""
 
 
 @dataclass(frozen=True)
@@ -183,15 +228,21 @@ class CaptureFiles:
     name: str  # name of the capture, in most layouts the folder's name
     folder: Path  # the folder with the files beside the images
     images: tuple[Path, ...]
-    # F x 3 text, or a file that names images, which sets the order of the images; None if no lights are needed
+    # F x 3 text, or a file that names images, which sets the order of the images; None if no lights
+    # are needed
     light_directions: Path | None
     light_intensities: Path | None = None  # F x 3 text, or None if no file gives them
     mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
-    boundaries: tuple[Path, ...] = ()  # used instead of a mask: images whose pixels above zero together are the object
+    boundaries: tuple[
+        Path, ...
+    ] = ()  # used instead of a mask: images whose pixels above zero together are the object
     ambient: Path | None = None  # an image under none of the lights, or None
-    others: tuple[Path, ...] = ()  # pictures beside the images that are not photographs, judging by their names
-    kept: tuple[int, ...] | None = None  # zero-based places in the light file of the images; None for all
+    others: tuple[
+        Path, ...
+    ] = ()  # pictures beside the images that are not photographs, judging by their names
+    # zero-based places in the light file of the images; None for all
+    kept: tuple[int, ...] | None = None
     warnings: tuple[CaptureWarning, ...] = ()  # choices made among files with unusual names
 
 
@@ -210,40 +261,62 @@ class Overrides:
 
     def named(self) -> tuple[Path, ...]:
         """Return the files that are given. Raises InputError for a path that is not a file."""
-        files = tuple(f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None)
+        files = tuple(
+            f
+            for f in (self.lights, self.intensities, self.mask, self.ground_truth)
+            if f is not None
+        )
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
         return files
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
-    files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
-    return next((files[name] for name in names if name in files and is_found_file(files[name])), None)
+    """Return the file with the first of these names in the folder, ignoring case; None if there is
+    none.
+    """
+    files = {
+        entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names
+    }
+    return next(
+        (files[name] for name in names if name in files and is_found_file(files[name])), None
+    )
 
 
 _MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
 
 
 def is_mask_name(path: Path) -> bool:
-    """Return whether a picture's name has the word "mask", as in NAME_mask.png, and is not one of our results."""
+    """Return whether a picture's name has the word "mask", as in NAME_mask.png, and is not one of
+    our results.
+    """
     stem = path.stem.lower()
     is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
     return is_picture and _MASK_WORD.search(stem) is not None
 
 
-def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return a mask for photographs without one of a usual name, and a warning that names it; None if none is found.
+def choose_mask(
+    folder: Path, images: Sequence[Path]
+) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
+    """Return a mask for photographs without one of a usual name, and a warning that names it; None
+    if none is found.
 
-    It is the only picture of their size with the word "mask" in its name, in the folder or beside it with the folder's
-    name; or else the alpha channel of the first photograph. If several pictures match, none is chosen.
+    It is the only picture of their size with the word "mask" in its name, in the folder or beside
+    it with the folder's name; or else the alpha channel of the first photograph. If several
+    pictures match, none is chosen.
     """
     name, of_images = folder_name(folder).lower(), images[0].parent
     entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
     with suppress(InputError):  # we may lack permission to read the parent folder
         around = list_folder(folder.absolute().parent)
-        entries += [path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name]
-    named = [path for path in entries if is_mask_name(path) and path not in images and is_found_file(path)]
+        entries += [
+            path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name
+        ]
+    named = [
+        path
+        for path in entries
+        if is_mask_name(path) and path not in images and is_found_file(path)
+    ]
     try:
         size = read_header(images[0]).size[0] if named else ()
         masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
@@ -255,32 +328,55 @@ def choose_mask(folder: Path, images: Sequence[Path]) -> tuple[Path | None, tupl
         return None, ()
     text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
     if masks[0] in images:
-        text = f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for another one."
+        text = (
+            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
+            " another one."
+        )
     if len(masks) > 1:
-        text = f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with --mask FILE."
+        text = (
+            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
+            " --mask FILE."
+        )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name. Raises InputError."""
+    """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name.
+    Raises InputError.
+    """
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"
 
 
-def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
-    """Return JSON values that change when a file of the capture does. Compute them before reading the files.
+def stamp_files(
+    files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]
+) -> tuple[Any, ...]:
+    """Return JSON values that change when a file of the capture does. Compute them before reading
+    the files.
 
-    Images and flat fields are stamped by path, size and modification time, because reading them is slow. All other
-    files (lights, intensities, mask, ground truth, ambient image) are stamped by their content. Raises InputError if a
-    file cannot be read.
+    Images and flat fields are stamped by path, size and modification time, because reading them is
+    slow. All other files (lights, intensities, mask, ground truth, ambient image) are stamped by
+    their content. Raises InputError if a file cannot be read.
     """
-    small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
+    small = (
+        files.light_directions,
+        files.light_intensities,
+        files.mask,
+        files.ground_truth,
+        files.ambient,
+    )
     contents = [stamp_content(path) for path in (*files.boundaries, *small) if path is not None]
-    return [*contents, *lamps], [*map(_path_size_and_time, files.images)], [*map(_path_size_and_time, flat_field)]
+    return (
+        [*contents, *lamps],
+        [*map(_path_size_and_time, files.images)],
+        [*map(_path_size_and_time, flat_field)],
+    )
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or the path, size and modification time of one over 64 MiB. Raises InputError."""
+    """Return the SHA-256 of a file, or the path, size and modification time of one over 64 MiB.
+    Raises InputError.
+    """
     check_file(path, "a file", pipe=True)
     if is_substitution(path):
         return hashlib.sha256(read_text(path)).hexdigest()

@@ -1,8 +1,10 @@
-"""Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in turn.
+"""Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in
+turn.
 
-The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds share. As published,
-PRPS/<object> contains images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse, each with one image
-for each line of the object's light.txt: 00000.tif and so on. A capture is one such folder.
+The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds
+share. As published, PRPS/<object> contains images_specular and images_metallic,
+PRPS_Diffuse/<object> images_diffuse, each with one image for each line of the object's light.txt:
+00000.tif and so on. A capture is one such folder.
 """
 
 import re
@@ -13,7 +15,13 @@ from pathlib import Path
 
 from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.light_files import FORMATS, find_lights, light_names, light_option, read_light_directions
+from splinecli.capture.light_files import (
+    FORMATS,
+    find_lights,
+    light_names,
+    light_option,
+    read_light_directions,
+)
 from splinecli.errors import InputError
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath, is_folder, resolve
@@ -24,9 +32,11 @@ _BOUNDARIES = ("inboundary.png", "onboundary.png")
 
 
 def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
-    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
+    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for
+    another layout.
 
-    Raises InputError if a file is missing, there are several such folders, or the images do not match the lights.
+    Raises InputError if a file is missing, there are several such folders, or the images do not
+    match the lights.
     """
     captures = list_cyclesps(folder)
     if captures is None:
@@ -43,12 +53,18 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
     lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
         problem = f"found no light.txt, expected the light directions of {images_folder.name}"
-        raise InputError(problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image")
+        raise InputError(
+            problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image"
+        )
     images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
     # The object is the union of both masks, so one alone would be wrong.
-    masks = {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
+    masks = (
+        {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
+    )
     if missing := [name for name, path in masks.items() if path is None]:
-        problem = f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        problem = (
+            f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        )
         raise InputError(problem, path=holder, hint="Pass --mask FILE")
     return files.CaptureFiles(
         "CyclesPS",
@@ -64,25 +80,41 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
 
 
 def list_cyclesps(folder: Path) -> list[Path] | None:
-    """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
+    """Return the folder if it is a folder of images, or the folders of images of an object; None
+    for another layout.
+    """
     is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
     usual_lights = [name for each in FORMATS if not each.rank for name in each.found]
-    if not (is_images_folder or _has_marks(folder)) or files.find_named(folder, usual_lights) is not None:
+    if (
+        not (is_images_folder or _has_marks(folder))
+        or files.find_named(folder, usual_lights) is not None
+    ):
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
-    captures = [entry for entry in files.list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    captures = [
+        entry
+        for entry in files.list_folder(folder)
+        if entry.name.startswith(_PREFIX) and is_folder(entry)
+    ]
     # Images beside light.txt are a plain folder, to be used with --lights light.txt.
     no_photographs = files.NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return None if not captures and files.list_images(folder, leave_out_stems=no_photographs) else captures
+    return (
+        None
+        if not captures and files.list_images(folder, leave_out_stems=no_photographs)
+        else captures
+    )
 
 
 def _name(images_folder: Path) -> str:
-    return f"{files.folder_name(_parent(images_folder))}_{files.folder_name(images_folder).removeprefix(_PREFIX)}"
+    inner = files.folder_name(images_folder).removeprefix(_PREFIX)
+    return f"{files.folder_name(_parent(images_folder))}_{inner}"
 
 
 def _has_marks(folder: Path) -> bool:
-    """Return whether there are two of four files: some may be missing, and no other folder is mistaken for one."""
+    """Return whether there are two of four files: some may be missing, and no other folder is
+    mistaken for one.
+    """
     marks = {"light.txt", "gt_normal.tif", *_BOUNDARIES}
     names = {entry.name.lower() for entry in files.list_folder(folder) if not is_folder(entry)}
     return len(marks & names) >= 2
@@ -107,7 +139,8 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
     return tuple(there[name] for name in wanted)
 
 
-_PSBOX_LIGHTS = ("light_directions.txt",)  # in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+# in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+_PSBOX_LIGHTS = ("light_directions.txt",)
 # Words in the names of pictures that other programs leave beside the photographs.
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
@@ -116,18 +149,25 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
     return not words.isdisjoint(re.findall(r"[a-z]+", image.stem.lower()))
 
 
-def find_capture_files(folder: StrPath, overrides: files.Overrides | None = None) -> files.CaptureFiles:
+def find_capture_files(
+    folder: StrPath, overrides: files.Overrides | None = None
+) -> files.CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
 
-    Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names an image that
-    does not exist; the light file is missing; or a file of the overrides does not exist.
+    Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names
+    an image that does not exist; the light file is missing; or a file of the overrides does not
+    exist.
     """
     folder, overrides = Path(folder), overrides or files.Overrides()
     files.list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
         # The plain folder comes last, because it accepts any folder with images.
-        return _find_psbox(folder, overrides) or find_cyclesps(folder, overrides) or _find_plain(folder, overrides)
+        return (
+            _find_psbox(folder, overrides)
+            or find_cyclesps(folder, overrides)
+            or _find_plain(folder, overrides)
+        )
     except files.NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
@@ -137,7 +177,9 @@ def find_capture_files(folder: StrPath, overrides: files.Overrides | None = None
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises InputError."""
+    """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises
+    InputError.
+    """
     folder = Path(folder)
     if is_film(folder):
         return folder.stem
@@ -148,31 +190,43 @@ def capture_name(folder: StrPath) -> str:
 
 
 def _own_name(folder: Path) -> str:
-    """Return the name of a folder, or its parent's name if the folder is called `images`. Raises InputError."""
+    """Return the name of a folder, or its parent's name if the folder is called `images`. Raises
+    InputError.
+    """
     name = files.folder_name(folder)
-    return files.folder_name(_parent(folder)) if name in files.IMAGE_FOLDERS and _parent(folder) != folder else name
+    return (
+        files.folder_name(_parent(folder))
+        if name in files.IMAGE_FOLDERS and _parent(folder) != folder
+        else name
+    )
 
 
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None or not all(map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))):
+    if inside is None or not all(
+        map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))
+    ):
         return None
     return inside if files.list_images(inside, leave_out_stems=files.NOT_PHOTOGRAPHS) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """Return the captures of a dataset's folder in natural order; only the folder itself if it is a capture.
+    """Return the captures of a dataset's folder in natural order; only the folder itself if it is a
+    capture.
 
-    A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
-    or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
-    captures are found by names of files; reading one may still fail. A subfolder that cannot be listed is treated as a
-    capture, so that the caller reports the error on reading it. Raises InputError if the folder is missing, is a file,
-    or contains no capture.
+    A capture is a folder with a light file beside its images, or beside the folder Objects that
+    contains them (PSBox), or a folder of images of a CyclesPS object. An object of CyclesPS and its
+    published tree are datasets, too. The captures are found by names of files; reading one may
+    still fail. A subfolder that cannot be listed is treated as a capture, so that the caller
+    reports the error on reading it. Raises InputError if the folder is missing, is a file, or
+    contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
-    captures = _captures_in(folder) or [capture for path in inside for capture in _captures_below(path)]
+    captures = _captures_in(folder) or [
+        capture for path in inside for capture in _captures_below(path)
+    ]
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
@@ -192,7 +246,9 @@ def _captures_in(folder: Path) -> list[Path]:
         is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
             files.find_named(folder, [files.FILENAMES]) is not None
-            or files.list_images(objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS)
+            or files.list_images(
+                objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS
+            )
             or _images_folder(folder) is not None
         ):
             return [folder]
@@ -200,7 +256,9 @@ def _captures_in(folder: Path) -> list[Path]:
 
 
 def _captures_below(folder: Path) -> list[Path]:
-    """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
+    """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's
+    tree.
+    """
     try:
         if folder.name in ("PRPS", "PRPS_Diffuse"):
             return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
@@ -210,13 +268,16 @@ def _captures_below(folder: Path) -> list[Path]:
 
 
 def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
-    """Return the capture's files. Raises InputError if images or lights are missing, or filenames.txt is wrong.
+    """Return the capture's files. Raises InputError if images or lights are missing, or
+    filenames.txt is wrong.
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
-    images, _ = files.find_images(of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    images, _ = files.find_images(
+        of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
+    )
     # Without a light file, nothing gives the number of photographs.
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
@@ -227,8 +288,10 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = (
-            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from images"
-            " of a mirror ball. Without one, --lights estimate finds them from the images, with lower accuracy"
+            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
+            " the file from images"
+            " of a mirror ball. Without one, --lights estimate finds them from the images, with"
+            " lower accuracy"
         )
         problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
         raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)
@@ -241,12 +304,16 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
-    """Return the files of a capture of PSBox, whose images are in a folder of their own; None for another layout."""
+    """Return the files of a capture of PSBox, whose images are in a folder of their own; None for
+    another layout.
+    """
     lights = overrides.lights or files.find_named(folder, _PSBOX_LIGHTS)
     objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
-    images = files.list_images(objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    images = files.list_images(
+        objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
+    )
     files.check_not_empty(images, objects)
     return _gather("PSBox", folder, images, lights, overrides)
 
@@ -264,7 +331,10 @@ def _gather(
 
     Files named by the user take precedence over files in the folder.
     """
-    mask, warnings = overrides.mask or files.find_named(folder, files.MASK), tuple[CaptureWarning, ...]()
+    mask, warnings = (
+        overrides.mask or files.find_named(folder, files.MASK),
+        tuple[CaptureWarning, ...](),
+    )
     if mask is None:
         mask, warnings = files.choose_mask(folder, images)
         others = tuple(path for path in others if not warnings or not files.is_mask_name(path))
@@ -274,7 +344,8 @@ def _gather(
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities or files.find_named(folder, ["light_intensities.txt"]),
+        light_intensities=overrides.intensities
+        or files.find_named(folder, ["light_intensities.txt"]),
         mask=mask,
         ground_truth=overrides.ground_truth or files.find_named(folder, ground_truth),
         others=others,

@@ -1,9 +1,11 @@
-"""Light files: the table of their formats, light directions and intensities, and lights that name their images.
+"""Light files: the table of their formats, light directions and intensities, and lights that name
+their images.
 
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 
-The names in a file often come from another machine, with folders that do not exist here, or are only numbers. So the
-images of the folder are matched to them by base name, then by name without suffix, then by order.
+The names in a file often come from another machine, with folders that do not exist here, or are
+only numbers. So the images of the folder are matched to them by base name, then by name without
+suffix, then by order.
 """
 
 import io
@@ -38,7 +40,9 @@ class WrongCountError(InputError):
 
 def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     meaning = light_rows.COLUMNS[form]
-    return light_rows.read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+    return light_rows.read_light_rows(
+        path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning)
+    )
 
 
 def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
@@ -65,23 +69,46 @@ class LightFormat:
     """A format of light files. To add one, write its reader and a row of FORMATS."""
 
     name: str  # for messages
-    suffixes: tuple[str, ...]  # in lower case; none for the format of all files with a suffix that no other row has
+    # in lower case; none for the format of all files with a suffix that no other row has
+    suffixes: tuple[str, ...]
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
-    found: tuple[str, ...]  # lower-case names of the light file of a folder; "*" stands for any text
-    rank: int = 0  # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an error
-    encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = None  # from directions (F, 3); None if only read
+    # lower-case names of the light file of a folder; "*" stands for any text
+    found: tuple[str, ...]
+    # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an
+    # error
+    rank: int = 0
+    # from directions (F, 3); None if only read
+    encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = None
 
 
 FORMATS = (
-    LightFormat("text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text),
-    LightFormat("NumPy", (".npy",), readers.read_matrix, ("light_directions.npy", "lights.npy"), encode=_encode_npy),
+    LightFormat(
+        "text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text
+    ),
+    LightFormat(
+        "NumPy",
+        (".npy",),
+        readers.read_matrix,
+        ("light_directions.npy", "lights.npy"),
+        encode=_encode_npy,
+    ),
     LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
     LightFormat("Relight", (".dome", ".json"), readers.read_json, ("*.dome",), 2),
     LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
     LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
-    LightFormat("CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_csv),
-    LightFormat("MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2),
-    LightFormat("OpenCV", (".yml", ".yaml", ".xml"), readers.read_matrix, ("*lightmatrix.yml", "lights.yml"), 2),
+    LightFormat(
+        "CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_csv
+    ),
+    LightFormat(
+        "MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2
+    ),
+    LightFormat(
+        "OpenCV",
+        (".yml", ".yaml", ".xml"),
+        readers.read_matrix,
+        ("*lightmatrix.yml", "lights.yml"),
+        2,
+    ),
 )
 """All formats of light files. This table defines how they are named, found, read and written."""
 
@@ -98,15 +125,24 @@ def light_names() -> str:
 
 def light_suffixes() -> str:
     """Return the suffixes of light files, for help."""
-    return ", ".join(dict.fromkeys(("text", *(suffix for each in FORMATS for suffix in each.suffixes))))
+    return ", ".join(
+        dict.fromkeys(("text", *(suffix for each in FORMATS for suffix in each.suffixes)))
+    )
 
 
 def find_lights(folder: Path) -> Path | None:
-    """Return the light file in the folder; None for none. Raises InputError for several where none is the usual one."""
+    """Return the light file in the folder; None for none. Raises InputError for several where none
+    is the usual one.
+    """
     entries = list_folder(folder)
     for rank in sorted({each.rank for each in FORMATS}):
         names = [name for each in FORMATS if each.rank == rank for name in each.found]
-        paths = [e for name in names for e in entries if fnmatchcase(e.name.lower(), name) and is_found_file(e)]
+        paths = [
+            e
+            for name in names
+            for e in entries
+            if fnmatchcase(e.name.lower(), name) and is_found_file(e)
+        ]
         if rank and len(paths) > 1:
             problem = f"found {len(paths)} light files: {', '.join(path.name for path in paths)}"
             raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
@@ -116,52 +152,68 @@ def find_lights(folder: Path) -> Path | None:
 
 
 def light_option(folders: Sequence[Path], n_images: int) -> str | None:
-    """Return the options that read a file in one of the folders as lights; None for no such file."""
+    """Return the options that read a file in one of the folders as lights;
+    None for no such file.
+    """
     suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
     for folder in folders:
         with suppress(InputError, OSError):
-            entries = [e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)]
+            entries = [
+                e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)
+            ]
             entries.sort(key=lambda e: "light" not in e.name.lower())
             for path in entries[:50]:
                 name = path.name.lower()
-                if re.search("intens|camera|filenames|lobes", name) or path.stat().st_size > numbers.MOST_TEXT:
+                if (
+                    re.search("intens|camera|filenames|lobes", name)
+                    or path.stat().st_size > numbers.MOST_TEXT
+                ):
                     continue
                 angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
                 for form in ("xyz", angles):
                     with suppress(InputError):
                         read_lights(path, n_images, form=form)
-                        return f"--lights {path}" + (f" --light-format {form}" if form != "xyz" else "")
+                        return f"--lights {path}" + (
+                            f" --light-format {form}" if form != "xyz" else ""
+                        )
     return None
 
 
 def read_light_directions(
-    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
+    path: StrPath,
+    n_images: int | None = None,
+    frame: LightFrame = USUAL_FRAME,
+    form: RowForm = "xyz",
 ) -> Float64Array:
     """Return unit light directions (F, 3) float64 from a light file, in the order of the file.
 
-    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the columns in another
-    order, and a first line with only the number of lights, are accepted (the University of Washington's lights.txt). If
-    N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is read as rows. A first column that counts the rows, from 0 or 1,
-    gives their order. Vectors may have any length above zero.
+    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the
+    columns in another order, and a first line with only the number of lights, are accepted (the
+    University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is
+    read as rows. A first column that counts the rows, from 0 or 1, gives their order. Vectors may
+    have any length above zero.
 
     Args:
         n_images: the expected number of lights, if it is known.
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
-        InputError: with the line, for a wrong number of columns, a word that is not a finite number, a zero vector or a
-            light below the horizon; also if the count disagrees with the count line or with n_images, and for angles
-            that are read as vectors.
+        InputError: with the line, for a wrong number of columns, a word that is not a finite
+            number, a zero vector or a light below the horizon; also if the count disagrees with the
+            count line or with n_images, and for angles that are read as vectors.
     """
     path = Path(path)
     return lights_of(format_of(path).read(path, n_images, form), n_images, frame, form)[1]
 
 
-def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> Float64Array:
-    """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
+def read_light_positions(
+    path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME
+) -> Float64Array:
+    """Return the positions of lamps (F, 3) float64 from a file, which has the form of light
+    directions.
 
-    Raises InputError as read_light_directions, which checks the same numbers as directions from the origin; also for
-    rows that name their images.
+    Raises InputError as read_light_directions, which checks the same numbers as directions from the
+    origin; also for rows that name their images.
     """
     path = Path(path)
     table = format_of(path).read(path, n_images, "positions")
@@ -174,13 +226,22 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
 
 
 def lights_of(
-    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm, *, leave_bad: bool = False
+    table: NumberRows,
+    n_images: int | None,
+    frame: LightFrame,
+    form: RowForm,
+    *,
+    leave_bad: bool = False,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length; see unit_directions."""
+    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length; see
+    unit_directions.
+    """
     if table.are_vectors:
         form = "positions" if form == "positions" else "xyz"
     else:
-        table = _sort_by_count(_drop_count_line(table, n_images), min(light_rows.COLUMNS[form]), n_images)
+        table = _sort_by_count(
+            _drop_count_line(table, n_images), min(light_rows.COLUMNS[form]), n_images
+        )
         if form == "xyz":
             light_rows.refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
@@ -191,11 +252,17 @@ def lights_of(
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     places = [
-        f" in column {light + 1}" if transposed else f" as light {light + 1}" if lines[light] is None else ""
+        f" in column {light + 1}"
+        if transposed
+        else f" as light {light + 1}"
+        if lines[light] is None
+        else ""
         for light in range(len(vectors))
     ]
     lamps = form == "positions"
-    return vectors, unit_directions(vectors, table.path, lines, places, lamps=lamps, leave_bad=leave_bad)
+    return vectors, unit_directions(
+        vectors, table.path, lines, places, lamps=lamps, leave_bad=leave_bad
+    )
 
 
 def unit_directions(
@@ -215,17 +282,24 @@ def unit_directions(
         vectors: of any length.
         places: words for the place of each vector on its line.
         lamps: whether the vectors are positions of lamps, for messages.
-        leave_bad: return a few lights that are zero or below the horizon as they are (z <= 0), for the caller to drop.
+        leave_bad: return a few lights that are zero or below the horizon as they are (z <= 0), for
+            the caller to drop.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    # First divide by the largest component, because squares of very large or small ones exceed float64's range.
+    # First divide by the largest component, because squares of very large or small ones exceed
+    # float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
-    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(directions):  # the frame is right
+    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(
+        directions
+    ):  # the frame is right
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            problem = f"found a zero vector{place}, expected a {'lamp position' if lamps else 'light direction'}"
+            problem = (
+                f"found a zero vector{place}, expected a"
+                f" {'lamp position' if lamps else 'light direction'}"
+            )
             hint = "Write x y z towards the light, or remove the line and its image"
             raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
@@ -241,10 +315,12 @@ def unit_directions(
 def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    A single number for each light is used for all three channels. Raises InputError as read_light_directions; also
-    with the line for an unusable intensity.
+    A single number for each light is used for all three channels. Raises InputError as
+    read_light_directions; also with the line for an unusable intensity.
     """
-    table = _drop_count_line(numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
+    table = _drop_count_line(
+        numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images
+    )
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
     for light, channel in np.argwhere(~light_rows.usable_intensities(intensities)):
@@ -257,7 +333,9 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
 
 
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
-    """Return the table in the order of a first column that counts the lights, and without that column."""
+    """Return the table in the order of a first column that counts the lights, and without that
+    column.
+    """
     rows = table.rows
     fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
     in_columns = n_images is None and len(rows) == n_columns  # one light in each
@@ -280,21 +358,28 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
         return without
     if not count.is_integer():
         expected = numbers.columns(len(following[0].numbers))
-        raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
+        raise InputError(
+            f"found 1 column, expected {expected} or a count", path=table.path, line=first.line
+        )
     problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
-    raise InputError(problem, path=table.path, line=first.line, hint="Correct the count or leave it out")
+    raise InputError(
+        problem, path=table.path, line=first.line, hint="Correct the count or leave it out"
+    )
 
 
 def _one_light_a_row(
     table: NumberRows, names: dict[int, str], what: str, n_images: int | None
 ) -> tuple[Float64Array, bool]:
-    """Return the numbers with one light in each row, and whether the file has one light in each column.
+    """Return the numbers with one light in each row, and whether the file has one light in each
+    column.
 
     `names` has the possible counts of numbers for a light, each with its meaning.
     """
     values = table.as_array()
     n_columns = values.shape[1]
-    readings = [(lights, lights is not values) for lights in (values, values.T) if lights.shape[1] in names]
+    readings = [
+        (lights, lights is not values) for lights in (values, values.T) if lights.shape[1] in names
+    ]
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.rows[0].text
@@ -308,7 +393,11 @@ def _one_light_a_row(
         if n_images is None or len(lights) == n_images:
             return lights, transposed
     count = len(readings[0][0])
-    what = {"light directions": "light direction", "lights": "light"}.get(what, what) if count == 1 else what
+    what = (
+        {"light directions": "light direction", "lights": "light"}.get(what, what)
+        if count == 1
+        else what
+    )
     problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
     error = WrongCountError(problem, path=table.path, hint=hint)
@@ -322,16 +411,19 @@ def rows_text(values: Float64Array) -> str:
 
 
 def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
-    """Return the image that each row names, and how it was matched: "name", "name without suffix" or "order".
+    """Return the image that each row names, and how it was matched: "name", "name without suffix"
+    or "order".
 
-    Images that no row names are left out, unless they are matched by order. Raises InputError if two rows have the same
-    name, or neither the names nor the number of images fit.
+    Images that no row names are left out, unless they are matched by order. Raises InputError if
+    two rows have the same name, or neither the names nor the number of images fit.
     """
     names = table.names or ()
     seen = set()
     for name, row in zip(names, table.rows, strict=True):
         if name.casefold() in seen:
-            raise InputError(f'a second light for the image "{name}"', path=table.path, line=row.line)
+            raise InputError(
+                f'a second light for the image "{name}"', path=table.path, line=row.line
+            )
         seen.add(name.casefold())
     for how, part in (("name", "name"), ("name without suffix", "stem")):
         by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
@@ -351,10 +443,11 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> tuple[NumberRows, Float64Array]:
-    """Return the rows of any light file, which may name their images (see match_images), and their directions (F, 3).
+    """Return the rows of any light file, which may name their images (see match_images), and their
+    directions (F, 3).
 
-    The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises InputError; see
-    read_light_directions. A few lights below the horizon are left as they are.
+    The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises
+    InputError; see read_light_directions. A few lights below the horizon are left as they are.
     """
     table = format_of(path).read(path, n_images, form)
     n_rows = n_images if table.names is None else None
@@ -362,15 +455,24 @@ def read_lights(
 
 
 def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
-    """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only be read."""
+    """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only
+    be read.
+    """
     encode = format_of(path).encode
     if encode is None:
-        *most, last = (".txt", *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes))
+        *most, last = (
+            ".txt",
+            *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes),
+        )
         hint = f"Write {', '.join(most)} or {last}"
-        raise UsageError(f"{path}: light files of the type {path.suffix.lower()} are only read", hint=hint)
+        raise UsageError(
+            f"{path}: light files of the type {path.suffix.lower()} are only read", hint=hint
+        )
     return encode
 
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
-    """Return a light file of directions (F, 3) of images, in the format that its suffix names; see check_writable."""
+    """Return a light file of directions (F, 3) of images, in the format that its suffix names; see
+    check_writable.
+    """
     return check_writable(path)(directions, images)

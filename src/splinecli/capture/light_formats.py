@@ -1,9 +1,10 @@
-"""Readers of light files that are not lines of numbers: RTI's .lp, AliceVision's JSON, Relight's .dome, other JSON, and
-matrices of NumPy, MATLAB and OpenCV. Each returns rows of numbers, some with the names of their images.
+"""Readers of light files that are not lines of numbers: RTI's .lp, AliceVision's JSON, Relight's
+.dome, other JSON, and matrices of NumPy, MATLAB and OpenCV. Each returns rows of numbers, some with
+the names of their images.
 
-A reader takes the path, the number of images if it is known, and the meaning of a row. Each raises InputError for a
-file that it cannot read. A file may have several matrices: the lights are the only one N x 3 or 3 x N that fits the
-images.
+A reader takes the path, the number of images if it is known, and the meaning of a row. Each raises
+InputError for a file that it cannot read. A file may have several matrices: the lights are the only
+one N x 3 or 3 x N that fits the images.
 """
 
 import json
@@ -26,23 +27,30 @@ from splinecli.system.files import parse_json
 
 
 def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may contain spaces.
+    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may
+    contain spaces.
 
     The number may be missing, as other programs leave it out.
     """
     stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
-        raise InputError("the file is empty, expected the number of lights on the first line", path=path)
+        raise InputError(
+            "the file is empty, expected the number of lights on the first line", path=path
+        )
     (first, count), *rows = content
     words = count.split()
     if len(words) > 3 and None not in map(to_number, words[-3:]):
         rows = content
     elif not count.isdecimal():
-        raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
+        raise InputError(
+            f'found "{count[:40]}", expected the number of lights', path=path, line=first
+        )
     elif int(count[:9]) != len(rows):
         problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
-        raise InputError(problem, path=path, line=first, hint="Correct the number, or restore the missing lines")
+        raise InputError(
+            problem, path=path, line=first, hint="Correct the number, or restore the missing lines"
+        )
     if not rows:
         raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
@@ -50,15 +58,21 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     for line, text in rows:
         words = text.rsplit(maxsplit=3)
         if len(words) < 4:
-            raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
+            raise InputError(
+                f'found "{text[:40]}", expected a file name and x y z', path=path, line=line
+            )
         names.append(image_name(words[0], []))
         words = numbers.split_words(" ".join(words[1:]), decimal_commas=commas)[:3]
-        vectors.append(Row(tuple(numbers.parse_number(word, path, line) for word in words), line, text))
+        vectors.append(
+            Row(tuple(numbers.parse_number(word, path, line) for word in words), line, text)
+        )
     return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
 
 
 def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision writes."""
+    """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision
+    writes.
+    """
     try:
         document = parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
@@ -87,7 +101,9 @@ class _Light(Struct):
 def _read_alicevision(document: Any, path: Path) -> NumberRows:
     listed = document.get("lights") if isinstance(document, dict) else None
     if not isinstance(listed, list) or not listed:
-        problem = 'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
+        problem = (
+            'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
+        )
         raise InputError(problem, path=path)
     names, vectors, intensities = [], [], []
     for number, values in enumerate(listed, start=1):
@@ -101,7 +117,9 @@ def _read_alicevision(document: Any, path: Path) -> NumberRows:
         vectors.append((x, -y, -z))
         intensities += [] if light.intensity is None else [light.intensity]
     if intensities and len(intensities) != len(listed):
-        problem = f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none"
+        problem = (
+            f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none"
+        )
         raise InputError(problem, path=path)
     return _unnumbered(path, vectors, names, intensities)
 
@@ -110,9 +128,11 @@ _DOME_POSITIONS = ("positions3d", "positionsSphere", "positions")
 
 
 def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
-    """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up) and z (camera).
+    """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up)
+    and z (camera).
 
-    Positions are interpreted as lamp positions. ledAdjust, by which Relight multiplies the images, gives intensities.
+    Positions are interpreted as lamp positions. ledAdjust, by which Relight multiplies the images,
+    gives intensities.
     """
     if not isinstance(document, dict):
         raise InputError("found no object, expected a dome as Relight writes it", path=path)
@@ -122,20 +142,33 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     keys = positions if form == "positions" else ("directions", *positions)
     key = next((key for key in keys if document.get(key)), None)
     if key is None:
-        raise InputError(f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path)
-    vectors, factors = _vectors(document[key], "xyz"), _vectors(document.get("ledAdjust"), "rgb") or []
+        raise InputError(
+            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path
+        )
+    vectors, factors = (
+        _vectors(document[key], "xyz"),
+        _vectors(document.get("ledAdjust"), "rgb") or [],
+    )
     if vectors is None or any(len(vector) != 3 for vector in vectors):
         raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
-        raise InputError(problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path=path)
+        raise InputError(
+            problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path=path
+        )
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's light by its name."""
-    if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()) is not None:
+    """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's
+    light by its name.
+    """
+    if (
+        isinstance(document, dict)
+        and len(document) == 1
+        and _vectors(*document.values()) is not None
+    ):
         (document,) = document.values()
     names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
     vectors = _vectors(document if names is None else list(document.values()))
@@ -143,11 +176,17 @@ def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] |
 
 
 def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
-    """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None for anything else."""
+    """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None
+    for anything else.
+    """
     listed = values if isinstance(values, list) else []
-    vectors: list[Any] = [[each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed]
+    vectors: list[Any] = [
+        [each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed
+    ]
     if not all(
-        isinstance(vector, list) and len(vector) > 1 and all(type(number) in (int, float) for number in vector)
+        isinstance(vector, list)
+        and len(vector) > 1
+        and all(type(number) in (int, float) for number in vector)
         for vector in vectors
     ):
         return None
@@ -155,7 +194,10 @@ def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
 
 
 def _unnumbered(
-    path: Path, vectors: Iterable[Sequence[float]], names: Sequence[str] | None, intensities: Sequence[Sequence[float]]
+    path: Path,
+    vectors: Iterable[Sequence[float]],
+    names: Sequence[str] | None,
+    intensities: Sequence[Sequence[float]],
 ) -> NumberRows:
     """Return vectors of a file without lines."""
     rows = tuple(Row(tuple(vector), None) for vector in vectors)
@@ -164,7 +206,8 @@ def _unnumbered(
 
 
 # OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
-# No part may match the start of another one: the backtracking would take minutes for a file of 1 MB.
+# No part may match the start of another one: the backtracking would take minutes for a file of 1
+# MB.
 _YAML = re.compile(
     r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
     r"\s+data:\s*\[([^][:]*)\]",
@@ -177,15 +220,27 @@ _XML = re.compile(
 
 
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count them from 1."""
+    """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count
+    them from 1.
+    """
     suffix = path.suffix.lower()
     numbers.check_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
     else:
-        array = _choose(numbers.read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images)
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
-        problem = f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3"
+        array = _choose(
+            numbers.read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images
+        )
+    if (
+        array.ndim != 2
+        or array.dtype.kind not in "fiu"
+        or not array.size
+        or not np.isfinite(array).all()
+    ):
+        problem = (
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite"
+            " numbers N x 3"
+        )
         raise InputError(problem, path=path)
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
     return NumberRows(path, tuple(Row(tuple(row), line) for line, row in rows))
@@ -193,13 +248,22 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 
 def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
-    lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
+    lights = {
+        name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape
+    }
     if len(lights) > 1:
-        lights = {name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))} or lights
+        lights = {
+            name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))
+        } or lights
     if len(lights) == 1:
         return next(iter(lights.values()))
-    sizes = ", ".join(f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items())
-    problem = f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x N{f': {sizes}' if sizes else ''}"
+    sizes = ", ".join(
+        f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items()
+    )
+    problem = (
+        f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
+        f" N{f': {sizes}' if sizes else ''}"
+    )
     hint = "Write the light directions into a text file, a line x y z for each image"
     raise InputError(problem, path=path, hint=hint)
 
@@ -211,14 +275,18 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
     except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
-        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
+        raise InputError(
+            "the .npy file is damaged, or contains no array of numbers", path=path
+        ) from None
 
 
 def _read_opencv(path: Path) -> dict[str, Float64Array]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
     text = numbers.read_text(path).decode(errors="replace")
     found: dict[str, Float64Array] = {}
-    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(text):
+    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(
+        text
+    ):
         try:
             values = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
             found[name] = values.reshape(int(rows), int(columns))

@@ -11,7 +11,13 @@ from typing import Literal
 
 import numpy as np
 
-from splinecli.capture.formats.numbers import NumberRows, Row, parse_rows, read_rows_of_words, to_number
+from splinecli.capture.formats.numbers import (
+    NumberRows,
+    Row,
+    parse_rows,
+    read_rows_of_words,
+    to_number,
+)
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float64Array
 
@@ -27,7 +33,8 @@ AXIS_WORDS = {
 
 _LEAST, _MOST = 1e-12, 1e12
 INTENSITIES = f"from {_LEAST:g} to {_MOST:g}"
-"""The range of light intensities. Such numbers and their inverses are within the range of float32."""
+"""The range of light intensities. Such numbers and their inverses are within the range of float32.
+"""
 
 EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
 
@@ -36,24 +43,38 @@ EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second
 class LightFrame:
     """The frame of a light file."""
 
-    signs: tuple[int, int, int] = (1, 1, 1)  # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
-    exchanged: bool = False  # whether the file has y before x. The signs belong to x and y in either order
+    # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
+    signs: tuple[int, int, int] = (
+        1,
+        1,
+        1,
+    )
+    # whether the file has y before x. The signs belong to x and y in either order
+    exchanged: bool = False
 
     @property
     def matrix(self) -> Float64Array:
-        """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the camera."""
+        """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the
+        camera.
+        """
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
         return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
 
     def __str__(self) -> str:
-        """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual direction are left out."""
+        """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual
+        direction are left out.
+        """
         words = [EXCHANGED] if self.exchanged else []
-        words += [name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1]
+        words += [
+            name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1
+        ]
         return ",".join(words) or "x-right,y-up"
 
     def describe(self) -> str:
         """Return words such as "x and y exchanged, y negated"; empty for the usual frame."""
-        negated = " and ".join(axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0)
+        negated = " and ".join(
+            axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0
+        )
         parts = ["x and y exchanged"] if self.exchanged else []
         if negated:
             parts.append(f"{negated} negated")
@@ -69,14 +90,17 @@ USUAL_FRAME = LightFrame()  # x right, y up, z to the camera, as in docs/files-a
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 
-PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1)))
+PLANE_FRAMES = tuple(
+    LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1))
+)
 """The eight frames with z to the camera; the usual one first."""
 
 
 def parse_light_frame(text: str | None) -> LightFrame:
     """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual one of None.
 
-    Axes that the list does not name are as usual. Raises UsageError for an unknown word or a repeated axis.
+    Axes that the list does not name are as usual. Raises UsageError for an unknown word or a
+    repeated axis.
     """
     if text is None:
         return USUAL_FRAME
@@ -88,16 +112,22 @@ def parse_light_frame(text: str | None) -> LightFrame:
             continue
         if word not in AXIS_WORDS:
             words = ", ".join((*AXIS_WORDS, EXCHANGED))
-            raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
+            raise UsageError(
+                f"--light-frame is {text!r}; expected words of {words}, separated by commas"
+            )
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
-            raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} is listed twice", hint="Leave one out")
+            raise UsageError(
+                f"--light-frame is {text!r}; {'xyz'[axis]} is listed twice", hint="Leave one out"
+            )
         signs[axis] = sign
     return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
 
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
-"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
+"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are
+in degrees.
+"""
 
 RowForm = LightForm | Literal["positions"]  # numbers of a row in a file of lights or of near lamps
 
@@ -113,12 +143,15 @@ AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format az
 
 
 def directions_from_angles(angles_deg: Float64Array, form: RowForm) -> Float64Array:
-    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
+    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in
+    degrees.
 
-    Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane towards the camera,
-    and the slant from the camera axis.
+    Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane
+    towards the camera, and the slant from the camera axis.
     """
-    azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
+    azimuth, elevation = np.radians(
+        [_azimuth_elevation(row, form) for row in angles_deg.tolist()]
+    ).T
     level = np.cos(elevation)
     return np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
 
@@ -135,16 +168,29 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         azimuth, elevation = _azimuth_elevation(row.numbers, form)
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
             if form == "slant-tilt":
-                problem = f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to 360 degrees"
+                problem = (
+                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
+                    " to 360 degrees"
+                )
                 hint = "The slant counts from the camera axis"
             else:
-                problem = f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and above 0 to 90"
+                problem = (
+                    f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
+                    " above 0 to 90"
+                )
                 problem += " degrees"
-                hint = "The elevation counts from the image plane: 90 is the direction of the camera"
+                hint = (
+                    "The elevation counts from the image plane: 90 is the direction of the camera"
+                )
             raise InputError(problem, path=table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
         problem = "no angle is above 2 pi, so they look like radians, expected degrees"
-        raise InputError(problem, path=table.path, line=table.rows[0].line, hint="Multiply them by 180 / pi = 57.2958")
+        raise InputError(
+            problem,
+            path=table.path,
+            line=table.rows[0].line,
+            hint="Multiply them by 180 / pi = 57.2958",
+        )
 
 
 def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
@@ -155,12 +201,16 @@ def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
 
 
 def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
-    """Return the lights (..., 3) that a mirror with these unit normals reflects towards the camera."""
+    """Return the lights (..., 3) that a mirror with these unit normals reflects towards the
+    camera.
+    """
     return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
 
 
 def refuse_angles(table: NumberRows) -> None:
-    """Raise InputError for rows that are clearly angles: two columns, or with a count, or with one radius for all."""
+    """Raise InputError for rows that are clearly angles: two columns, or with a count, or with one
+    radius for all.
+    """
     rows = [row.numbers for row in table.rows]
     lengths = {len(row) for row in rows}
     if len(rows) <= 3 or lengths not in ({2}, {3}):
@@ -168,20 +218,32 @@ def refuse_angles(table: NumberRows) -> None:
     numbered = lengths == {3} and counts_rows([row[0] for row in rows]) is not None
     found, hint = "", AZEL_HINT
     if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
-        found = f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3 columns (x y z)"
-    elif lengths == {3} and not numbered:  # perhaps with the same radius; vectors around an object have y < 0
+        found = (
+            f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3"
+            " columns (x y z)"
+        )
+    elif (
+        lengths == {3} and not numbered
+    ):  # perhaps with the same radius; vectors around an object have y < 0
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
-            found, hint = f"azimuth, elevation and {radius[0]:g}, expected x y z", f"Leave the third column out. {hint}"
+            found, hint = (
+                f"azimuth, elevation and {radius[0]:g}, expected x y z",
+                f"Leave the third column out. {hint}",
+            )
     if found:
         raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
 
 
 def counts_rows(column: list[float]) -> int | None:
-    """Return the first number of a column that counts the rows in some order, 0 or 1; None for any other column."""
+    """Return the first number of a column that counts the rows in some order, 0 or 1; None for any
+    other column.
+    """
     ordered = sorted(column)
-    return next((first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None)
+    return next(
+        (first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None
+    )
 
 
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
@@ -190,17 +252,18 @@ _AXES, _ANGLES, _SLANTS = ("x", "y", "z"), ("az", "el"), ("slant", "tilt")
 
 
 def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
-    """Return the rows of a text file, without "#" comments, blank lines and a header (a first row without numbers).
+    """Return the rows of a text file, without "#" comments, blank lines and a header (a first row
+    without numbers).
 
-    Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are the light. A header
-    that names them, as "z y x" or "elevation azimuth", gives their order.
+    Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are
+    the light. A header that names them, as "z y x" or "elevation azimuth", gives their order.
 
     Args:
         n_numbers: the number of numbers that follow a name.
 
     Raises:
-        InputError: with the line, for a word that is not a finite number; also for a file without rows, and for a
-            header or rows that are clearly other angles than expected.
+        InputError: with the line, for a word that is not a finite number; also for a file without
+            rows, and for a header or rows that are clearly other angles than expected.
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
@@ -221,16 +284,24 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
             without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
             return replace(_reordered(parse_rows(without_names, path), order), names=names)
         angles = [words[1:] for *_, words in body if None not in map(to_number, words[1:])]
-        if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [len(_ANGLES)]:
+        if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [
+            len(_ANGLES)
+        ]:
             problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
             raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
     return _reordered(parse_rows(rows, path), order)
 
 
 def _order_of(header: list[str]) -> list[int]:
-    """Return the places of x, y and z, azimuth and elevation, or slant and tilt in a header; else the usual places."""
+    """Return the places of x, y and z, azimuth and elevation, or slant and tilt in a header; else
+    the usual places.
+    """
     words = [word.lower().strip("\"'") for word in header]
-    for pattern, wanted in ((_AXIS.fullmatch, _AXES), (_ANGLE.match, _ANGLES), (_ANGLE.match, _SLANTS)):
+    for pattern, wanted in (
+        (_AXIS.fullmatch, _AXES),
+        (_ANGLE.match, _ANGLES),
+        (_ANGLE.match, _SLANTS),
+    ):
         found = [match[1].replace("alt", "el") for word in words if (match := pattern(word))]
         if len(words) == len(wanted) and sorted(found) == sorted(wanted):
             return [found.index(name) for name in wanted]
@@ -242,13 +313,19 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
 
     def reorder(row: Row) -> Row:
         last = row.numbers[first:]
-        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order))) if len(last) == -first else row
+        return (
+            row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order)))
+            if len(last) == -first
+            else row
+        )
 
     return replace(table, rows=tuple(map(reorder, table.rows)))
 
 
 def image_name(text: str, numbers: list[str]) -> str:
-    """Return the image name before the last numbers of a row, without folders, quotes and separators."""
+    """Return the image name before the last numbers of a row, without folders, quotes and
+    separators.
+    """
     for word in reversed(numbers):
         text = text.rstrip(" \t,;")[: -len(word)]
     return re.split(r"[/\\]", text.strip(" \t,;\"'"))[-1]

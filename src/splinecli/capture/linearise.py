@@ -1,5 +1,6 @@
-"""Observations from images: decode, take the window and the mask, invert the transfer curve, subtract ambient light,
-divide by the falloff and by the light's intensity. The last step is shared by files and arrays."""
+"""Observations from images: decode, take the window and the mask, invert the transfer curve,
+subtract ambient light, divide by the falloff and by the light's intensity. The last step is shared
+by files and arrays."""
 
 from __future__ import annotations
 
@@ -28,9 +29,12 @@ Numbers = TypeVar("Numbers", bound=np.generic)
 
 @dataclass(frozen=True)
 class Window:
-    """The pixels of the images that are read. Images are subsampled without averaging, so stored values are kept."""
+    """The pixels of the images that are read. Images are subsampled without averaging, so stored
+    values are kept.
+    """
 
-    box: tuple[int, int, int, int] | None = None  # left, top, width and height in pixels; None for whole images
+    # left, top, width and height in pixels; None for whole images
+    box: tuple[int, int, int, int] | None = None
     step: int = 1  # one of so many rows and columns is read
     shape: tuple[int, ...] | None = None  # (H, W) of the whole images, if only a part is read
 
@@ -62,14 +66,18 @@ class Window:
         return np.asarray(to_window @ matrix, np.float64)
 
     def filled(self, mask: Bools) -> Bools:
-        """Return the mask of whole images from a mask of the window. Each pixel represents its skipped neighbours."""
+        """Return the mask of whole images from a mask of the window. Each pixel represents its
+        skipped neighbours.
+        """
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         part = replace(self, step=1).of(whole)
         part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
         return whole
 
     def on(self, image: ImageHeader) -> Window:
-        """Return the window on images of the size of this one. Raises InputError if the box is not inside."""
+        """Return the window on images of the size of this one. Raises InputError if the box is not
+        inside.
+        """
         if self.is_whole:
             return self
         height, width = shape = image.size[0][:2]
@@ -92,7 +100,10 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
         found = re.fullmatch(r"\d{1,9}(?:,\d{1,9}){3}", crop.replace(" ", ""))
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
-            problem = f"--crop is {crop!r}; expected X,Y,W,H: the upper left corner and the size in pixels"
+            problem = (
+                f"--crop is {crop!r}; expected X,Y,W,H: the upper left corner and the size in"
+                " pixels"
+            )
             raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
     found = re.fullmatch(r"1(?:/(\d{1,3}))?", "1" if scale is None else scale.replace(" ", ""))
     step = int(found[1] or 1) if found else 0
@@ -106,39 +117,63 @@ class RadiometricCalibration:
     """How stored values become linear light."""
 
     curve: TransferCurve = 1.0  # the images' transfer curve
-    ambient: Path | None = None  # an image under ambient light alone, which is subtracted from all others
-    # images of a uniform white surface, one for each light or one for all. Images are divided by them
+    # an image under ambient light alone, which is subtracted from all others
+    ambient: Path | None = None
+    # images of a uniform white surface, one for each light or one for all. Images are divided by
+    # them
     flat_field: tuple[Path, ...] = ()
     automatic: bool = False  # whether the curve that all images state is used instead of `curve`
 
-    def with_stated_curve(self, images: Sequence[ImageHeader]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
-        """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
+    def with_stated_curve(
+        self, images: Sequence[ImageHeader]
+    ) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
+        """Return this calibration with the curve that all images state, if it is automatic, and
+        warnings.
+        """
         if self.curve != 1:
             return self, []
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
         if not self.automatic:
-            text = f"The images say that they are display-encoded ({by}), but are read as linear, as --transfer says."
+            text = (
+                f"The images say that they are display-encoded ({by}), but are read as linear, as"
+                " --transfer says."
+            )
             text += " Leave it out if their values are not linear."
             return self, [CaptureWarning(codes.DISPLAY_ENCODED, text)] if by else []
         unread, warnings = [image.path.name for image in images if image.curve.unread], []
         if unread:
-            text = f"The colour profile of {unread[0]} has no curve that can be read, so it does not count."
-            warnings.append(CaptureWarning(codes.PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G."))
+            text = (
+                f"The colour profile of {unread[0]} has no curve that can be read, so it does not"
+                " count."
+            )
+            warnings.append(
+                CaptureWarning(
+                    codes.PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G."
+                )
+            )
         curve, *others = {image.curve.curve for image in images}
         if others:
             text = (
-                f"The images look display-encoded ({by}) but are read as linear. Add --transfer srgb if they are sRGB."
+                f"The images look display-encoded ({by}) but are read as linear. Add --transfer"
+                " srgb if they are sRGB."
             )
             return self, [*warnings, CaptureWarning(codes.DISPLAY_ENCODED, text)]
         if curve not in (1, BT709):  # a film has no other curve
-            how = "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}" if curve else "sRGB"
+            how = (
+                "the profile says"
+                if isinstance(curve, tuple)
+                else f"gamma:{curve:g}"
+                if curve
+                else "sRGB"
+            )
             text = f"The images say that they are display-encoded ({by}) and are read as {how}."
             text += " Add --transfer linear if their values are linear."
             warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
         return replace(self, curve=curve), warnings
 
 
-AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images state a curve
+# stored values are linear light, unless all images state a curve
+AUTOMATIC = RadiometricCalibration(automatic=True)
 AS_STORED = RadiometricCalibration()  # stored values are linear light
 EVERY_PIXEL = slice(None)
 
@@ -146,9 +181,10 @@ EVERY_PIXEL = slice(None)
 def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float32Array:
     """Return stored values of any shape as linear light. Raises InputError as to_linear does.
 
-    Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does not record which. A
-    value v then represents light between v - 0.5 and v + 0.5, or between v and v + 1. Adding a quarter of a step halves
-    the error in both cases; in dark pixels, this error changes the normals.
+    Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does
+    not record which. A value v then represents light between v - 0.5 and v + 0.5, or between v and
+    v + 1. Adding a quarter of a step halves the error in both cases; in dark pixels, this error
+    changes the normals.
     """
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
@@ -164,7 +200,9 @@ def take_pixels(image: Array, mask: Bools) -> Array:
 
 
 def take_around(image: Array, around: Bools) -> Array:
-    """Return the pixels (R, C) around the object. Invalid values, such as NaN, become 0, so every pixel is kept."""
+    """Return the pixels (R, C) around the object. Invalid values, such as NaN, become 0, so every
+    pixel is kept.
+    """
     pixels = take_pixels(image, around)
     if pixels.dtype.kind == "f":
         pixels = np.where(np.isfinite(pixels) & (pixels > 0), pixels, 0).astype(pixels.dtype)
@@ -180,17 +218,22 @@ def pixel_reader(
     wanted: Integers | slice = EVERY_PIXEL,
     around: Bools | None = None,
 ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
-    """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as stored, and linear light.
+    """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as
+    stored, and linear light.
 
-    The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the mask `around` (H, W).
+    The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the
+    mask `around` (H, W).
 
-    The ambient image and a common flat field are read now, once. Both functions raise InputError for an unreadable
-    image, this one also for a wrong number of flat fields. Messages name `like` as the image of the expected size.
+    The ambient image and a common flat field are read now, once. Both functions raise InputError
+    for an unreadable image, this one also for a wrong number of flat fields. Messages name `like`
+    as the image of the expected size.
     """
     flats = radiometry.flat_field
     ambient: Float32Array | None = None
     if len(flats) not in (0, 1, n_images):
-        problem = f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+        problem = (
+            f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
+        )
         raise InputError(problem, path=flats[0].parent)
 
     def pixels(
@@ -200,7 +243,11 @@ def pixel_reader(
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         image = window.of(image)
         stored = take_pixels(image, mask)
-        used = stored[wanted] if around is None else np.concatenate((stored, take_around(image, around)))
+        used = (
+            stored[wanted]
+            if around is None
+            else np.concatenate((stored, take_around(image, around)))
+        )
         linear = linear_light(used, path, radiometry.curve)
         return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
 
@@ -209,7 +256,8 @@ def pixel_reader(
         mean = linear[: len(stored)].mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
-        return np.asarray(np.maximum(linear / mean, 0.02), np.float32)  # darker places do not show the falloff
+        # darker places do not show the falloff
+        return np.asarray(np.maximum(linear / mean, 0.02), np.float32)
 
     if radiometry.ambient is not None:
         ambient = pixels(radiometry.ambient)[1]
@@ -229,12 +277,14 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    linear: Float32Array  # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
+    # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
+    linear: Float32Array
     intensity: Float64Array  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states, or None
 
     def observe(self) -> Float32Array:
-        """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
+        """Return observations (P,): each channel is divided by its intensity, then the mean is
+        taken.
 
         A gray image is equal in all channels.
         """
@@ -244,11 +294,15 @@ class StoredPixels:
         return self.linear @ weights.astype(np.float32)
 
     def find_saturated(self, white_level: float | None) -> ImageValues:
-        """Return the image statistics that decide which pixels are saturated, from look_at. Raises InputError."""
+        """Return the image statistics that decide which pixels are saturated, from look_at. Raises
+        InputError.
+        """
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
     def colours(self) -> Float32Array:
-        """Return linear RGB (P, 3), each channel divided by its intensity; lamps do not tint gray images."""
+        """Return linear RGB (P, 3), each channel divided by its intensity; lamps do not tint gray
+        images.
+        """
         if self.linear.shape[1] == 1:
             return np.repeat(self.observe()[:, None], 3, axis=1)
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
@@ -263,21 +317,28 @@ class Observed(NamedTuple):
     observations: Float32Array  # (P, F)
     saturation: Saturation
     warnings: list[CaptureWarning]
-    colours: Float64Array | None  # (F, 3), of the lamps, which are divided out; None if they do not differ
+    # (F, 3), of the lamps, which are divided out; None if they do not differ
+    colours: Float64Array | None
     blur: float | None  # the standard deviation in pixels of the blur that was removed
 
 
 def collect_observations(
-    images: Iterable[StoredPixels], n_pixels: int, n_images: int, white_level: float | None, n_around: int = 0
+    images: Iterable[StoredPixels],
+    n_pixels: int,
+    n_images: int,
+    white_level: float | None,
+    n_around: int = 0,
 ) -> tuple[Float32Array, Saturation, list[CaptureWarning], Float64Array | None]:
-    """Return observations (P + R, F) of the images in their order, which are saturated, warnings, and colours of lamps.
+    """Return observations (P + R, F) of the images in their order, which are saturated, warnings,
+    and colours of lamps.
 
     The last R observations are of pixels around the mask. Everything else concerns the mask alone.
 
-    The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are not divided out.
+    The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are
+    not divided out.
 
-    Only one image is in memory at a time. The white level is given by the user, or None to find it. Raises InputError
-    if it is above an image's full scale.
+    Only one image is in memory at a time. The white level is given by the user, or None to find it.
+    Raises InputError if it is above an image's full scale.
     """
     observations = np.empty((n_pixels + n_around, n_images), np.float32)
     any_8_bit, found, colours = False, list[ImageValues](), list[Float32Array]()
@@ -293,15 +354,28 @@ def collect_observations(
     warnings = white_level_warnings(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(n_pixels * n_images, 1)
     if saturated > codes.SATURATED_SHARE:
-        text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."
+        text = (
+            f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives"
+            " better normals."
+        )
         warnings.append(CaptureWarning(codes.SATURATED, text))
     black = (n_pixels - np.count_nonzero(observations[:n_pixels].any(axis=1))) / max(n_pixels, 1)
     if black > 0.01:
-        text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+        text = (
+            f"{100 * black:.1f} % of the pixels are black under every light; they get the normal"
+            " (0, 0, 1)."
+        )
         text += " Leave them out with a mask or with --auto-mask."
         warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
-    of_lamps, found_warnings = lamp_colours(np.stack(colours)) if len(colours) == n_images else (None, [])
-    return observations, saturation, [*warnings, *codes.eight_bit(any_8_bit), *found_warnings], of_lamps
+    of_lamps, found_warnings = (
+        lamp_colours(np.stack(colours)) if len(colours) == n_images else (None, [])
+    )
+    return (
+        observations,
+        saturation,
+        [*warnings, *codes.eight_bit(any_8_bit), *found_warnings],
+        of_lamps,
+    )
 
 
 def read_observations(
@@ -313,23 +387,36 @@ def read_observations(
     *,
     divides_colours: bool = True,
 ) -> Observed:
-    """Return the observations of a mask's pixels, without the blur of the lens and the colours of lamps that differ.
+    """Return the observations of a mask's pixels, without the blur of the lens and the colours of
+    lamps that differ.
 
     Args:
-        images: gives the pixels of the images, divided by the colours (F, 3) of the lamps if it is given some.
-        around: the pixels around the mask, whose observations follow those of the mask, to find the blur; None for
-            images whose blur stays.
+        images: gives the pixels of the images, divided by the colours (F, 3) of the lamps if it is
+            given some.
+        around: the pixels around the mask, whose observations follow those of the mask, to find the
+            blur; None for images whose blur stays.
         white_level: see collect_observations.
         divides_colours: whether the lamps may have different colours.
     """
-    sizes = int(np.count_nonzero(mask)), n_images, white_level, 0 if around is None else int(np.count_nonzero(around))
+    sizes = (
+        int(np.count_nonzero(mask)),
+        n_images,
+        white_level,
+        0 if around is None else int(np.count_nonzero(around)),
+    )
     observations, saturation, warnings, colours = collect_observations(images(None), *sizes)
     if not divides_colours:
-        warnings, colours = [each for each in warnings if each.kind != codes.ESTIMATED_COLOURS], None
+        warnings, colours = (
+            [each for each in warnings if each.kind != codes.ESTIMATED_COLOURS],
+            None,
+        )
     if colours is not None:  # only the mean of the channels was kept, so the images are read again
         del observations
         of_colours = [each for each in warnings if each.kind == codes.ESTIMATED_COLOURS]
         observations, saturation, warnings, _ = collect_observations(images(colours), *sizes)
-        warnings = [*of_colours, *(each for each in warnings if each.kind != codes.ESTIMATED_COLOURS)]
+        warnings = [
+            *of_colours,
+            *(each for each in warnings if each.kind != codes.ESTIMATED_COLOURS),
+        ]
     blur = None if around is None else remove_blur(observations, mask, around)
     return Observed(observations[: sizes[0]], saturation, warnings, colours, blur)

@@ -1,8 +1,8 @@
-"""Lamps at arm's length: their positions, the scale that relates pixels to the unit of the positions, their files, and
-checks that the positions are plausible.
+"""Lamps at arm's length: their positions, the scale that relates pixels to the unit of the
+positions, their files, and checks that the positions are plausible.
 
-The frame is the same as for light directions: x right, y up, z to the camera. The origin is on the object's mean plane,
-at the centre of the image. Positions may be in any unit, such as millimetres.
+The frame is the same as for light directions: x right, y up, z to the camera. The origin is on the
+object's mean plane, at the centre of the image. Positions may be in any unit, such as millimetres.
 """
 
 from __future__ import annotations
@@ -33,24 +33,36 @@ from splinecli.system.files import is_substitution
 class NearLamps:
     """F lamps as points of light, over an image of known scale.
 
-    Raises InputError if a position is not finite or not in front of the object, or the pixel size is not above 0.
+    Raises InputError if a position is not finite or not in front of the object, or the pixel size
+    is not above 0.
     """
 
     positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
-    pixel_size: float  # the width of a pixel on the object's mean plane, in the unit of the positions
-    middle: tuple[float, float]  # row and column of the origin, in pixels of the window that was read
-    # (F,), the distances along each lamp's axis at which the observations' light intensities hold. See `of`
+    # the width of a pixel on the object's mean plane, in the unit of the positions
+    pixel_size: float
+    # row and column of the origin, in pixels of the window that was read
+    middle: tuple[float, float]
+    # (F,), the distances along each lamp's axis at which the observations' light intensities hold.
+    # See `of`
     reference_distances: Float64Array
-    camera_matrix: Float64Array | None = None  # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
-    points: Float32Array | None = None  # (P, 3), the surface in the pixels, in this unit; None if unknown
-    # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its intensity
-    # is cos(a)^mu, the model of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section 2.1). None for
-    # lamps that emit equally in all directions
+    # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    camera_matrix: Float64Array | None = None
+    # (P, 3), the surface in the pixels, in this unit; None if unknown
+    points: Float32Array | None = None
+    # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the
+    # axis, its intensity is cos(a)^mu, the model of an LED (Quéau et al., LED-based photometric
+    # stereo, JMIV 2018, section 2.1). None for lamps that emit equally in all directions
     lobes: Float64Array | None = None
 
     def __post_init__(self) -> None:
-        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
-            raise InputError(f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)")
+        if (
+            self.positions.ndim != 2
+            or self.positions.shape[1] != 3
+            or not np.isfinite(self.positions).all()
+        ):
+            raise InputError(
+                f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)"
+            )
         if (self.positions[:, 2] <= 0).any():
             raise InputError("a lamp is behind the object (z <= 0)", hint="z points to the camera")
         if not 0 < self.pixel_size < np.inf:
@@ -70,21 +82,30 @@ class NearLamps:
         """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
         Args:
-            equal: whether the light intensities are unknown, so that all lamps are assumed to be equally bright along
-                their axes. Otherwise each intensity holds at the origin, where a gray card would measure it.
+            equal: whether the light intensities are unknown, so that all lamps are assumed to be
+                equally bright along their axes. Otherwise each intensity holds at the origin, where
+                a gray card would measure it.
         """
         distances = np.linalg.norm(positions, axis=1)
         if equal:
             distances = np.full_like(distances, distances.mean())
         elif lobes is not None:
-            distances = distances / np.sqrt(_within_lobes(lobes, positions[None] / distances[:, None])[0])
+            distances = distances / np.sqrt(
+                _within_lobes(lobes, positions[None] / distances[:, None])[0]
+            )
         middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
 
-    def within(self, left: float, top: float, step: int, camera_matrix: Float64Array | None) -> NearLamps:
-        """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
+    def within(
+        self, left: float, top: float, step: int, camera_matrix: Float64Array | None
+    ) -> NearLamps:
+        """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of
+        these pixels.
+        """
         middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
-        return replace(self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix)
+        return replace(
+            self, pixel_size=step * self.pixel_size, middle=middle, camera_matrix=camera_matrix
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the lamps as JSON values: their distances from the origin, and the scale."""
@@ -98,34 +119,47 @@ class NearLamps:
 
     def turned(self, directions: Float64Array) -> NearLamps:
         """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
-        return replace(self, positions=directions * np.linalg.norm(self.positions, axis=1, keepdims=True))
+        return replace(
+            self, positions=directions * np.linalg.norm(self.positions, axis=1, keepdims=True)
+        )
 
     def choose_lights(self, positions: Sequence[int]) -> NearLamps:
         """Return some of the lamps, in the order given."""
         chosen = list(positions)
-        lobes, distances = None if self.lobes is None else self.lobes[chosen], self.reference_distances[chosen]
-        return replace(self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes)
+        lobes, distances = (
+            None if self.lobes is None else self.lobes[chosen],
+            self.reference_distances[chosen],
+        )
+        return replace(
+            self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes
+        )
 
     def choose_pixels(self, rows: slice | Integers) -> NearLamps:
         """Return the lamps with the surface in some of the pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
     def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Float64Array:
-        """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
+        """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the
+        image.
+        """
         middle_row, middle_column = self.middle
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 
     def extent(self, mask: Bools) -> tuple[tuple[float, float], Float64Array]:
-        """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on the mean plane."""
+        """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on
+        the mean plane.
+        """
         rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
         width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
     def angles_across_deg(self, mask: Bools) -> Float64Array:
-        """Return the largest deviation of each lamp's direction (F,) from its direction at the middle of the object.
+        """Return the largest deviation of each lamp's direction (F,) from its direction at the
+        middle of the object.
 
-        Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
+        Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean
+        plane.
         """
         rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
         row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
@@ -135,38 +169,47 @@ class NearLamps:
     def light_at(self, points: Floats) -> tuple[Float32Array, Float32Array]:
         """Return the light at points (P, 3): unit directions (P, F, 3), and attenuations (P, F).
 
-        The attenuation is the inverse square of the distance, relative to the light at the lamp's reference distance,
-        times the lamp's lobe.
+        The attenuation is the inverse square of the distance, relative to the light at the lamp's
+        reference distance, times the lamp's lobe.
         """
         towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
         towards /= distance[..., None]
         attenuation = np.square(self.reference_distances.astype(np.float32) / distance)
-        return towards, attenuation if self.lobes is None else attenuation * _within_lobes(self.lobes, towards)
+        return towards, attenuation if self.lobes is None else attenuation * _within_lobes(
+            self.lobes, towards
+        )
 
 
 def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
-    """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
+    """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps;
+    along the axes 1.
+    """
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
     # Observations are divided by the lobe, and so is their noise. Outside, a pixel looks shadowed.
     return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=0.05)
 
 
 UNIT_HINT = (
-    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the pixel size or object"
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the"
+    " pixel size or object"
     " width"
 )
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Warn of implausible lamps over an object with this mask (H, W), from a file of positions, if any.
+    """Warn of implausible lamps over an object with this mask (H, W), from a file of positions, if
+    any.
 
     Raises InputError if a lamp would be inside the object or hide it from the camera.
     """
     sizes, middle = lamps.extent(mask)
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
-    text = f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is {sizes[0]:.3g} wide"
+    text = (
+        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is"
+        f" {sizes[0]:.3g} wide"
+    )
     if distances[nearest] < 0.5 * min(sizes):
         raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
     if distances[nearest] < max(sizes):
@@ -175,33 +218,44 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
     if distances[nearest] > 300.0 * max(sizes):
         return [
             CaptureWarning(
-                LAMP_DISTANCE, f"The lamps are so far away that their light is parallel: {text}. {UNIT_HINT}."
+                LAMP_DISTANCE,
+                f"The lamps are so far away that their light is parallel: {text}. {UNIT_HINT}.",
             )
         ]
     return []
 
 
-def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: Bools) -> list[CaptureWarning]:
-    """Warn that lights are treated as distant over a mask (H, W), although a file has their positions.
+def distant_lights(
+    positions: Path | None, lamps: NearLamps | None, mask: Bools
+) -> list[CaptureWarning]:
+    """Warn that lights are treated as distant over a mask (H, W), although a file has their
+    positions.
 
     The lamps of the file are None if their scale is unknown.
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
-        text = f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or --object-width."
+        text = (
+            f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or"
+            " --object-width."
+        )
         return [CaptureWarning(NEAR_LAMPS, text)]
     angle_deg = lamps.angles_across_deg(mask).max()
     if angle_deg <= 2.0:
         return []
     text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
-        " and the edge of the object, but the lights are treated as distant. Use --light-positions instead of --lights."
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f}"
+        " degrees between the middle"
+        " and the edge of the object, but the lights are treated as distant. Use --light-positions"
+        " instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
 
 def positions_as_directions(path: Path) -> list[CaptureWarning]:
-    """Warn of a text file of light directions whose vectors have lengths as positions of lamps have."""
+    """Warn of a text file of light directions whose vectors have lengths as positions of lamps
+    have.
+    """
     if is_substitution(path) or format_of(path).read != FORMATS[0].read:
         return []
     try:
@@ -213,7 +267,8 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     if len(lengths) < 3 or lengths.min() < 3.0 or lengths.max() < 1.02 * lengths.min():
         return []
     text = (
-        f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g}, as positions of"
+        f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g},"
+        " as positions of"
         " lamps have, but are read as directions. If they are positions, use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
@@ -221,7 +276,8 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
 
 @dataclass(frozen=True, kw_only=True)
 class LampOptions:
-    """The user's options for near lamps and the camera. All lengths have the same unit, such as millimetres.
+    """The user's options for near lamps and the camera. All lengths have the same unit, such as
+    millimetres.
 
     Raises UsageError if two options contradict each other.
     """
@@ -229,16 +285,23 @@ class LampOptions:
     positions: str | None = None  # a file of lamp positions, which replaces the light file
     distance: float | None = None  # of all lamps from the middle of the object, in their directions
     pixel_size: float | None = None  # the width of a pixel on the object's mean plane
-    scales_surface: bool = False  # whether the pixel size is given for the surface, so that it needs no lamps
+    # whether the pixel size is given for the surface, so that it needs no lamps
+    scales_surface: bool = False
     object_width: float | None = None  # from the first to the last column of the mask
     camera_matrix: str | None = None  # a file of the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
-                raise UsageError(f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out")
+                raise UsageError(
+                    f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other",
+                    hint="Leave one out",
+                )
         if self.distance is not None and self.pixel_size is None and self.object_width is None:
-            raise UsageError("--light-distance needs the size of a pixel", hint="Add --pixel-size or --object-width")
+            raise UsageError(
+                "--light-distance needs the size of a pixel",
+                hint="Add --pixel-size or --object-width",
+            )
 
     @property
     def given(self) -> str | None:
@@ -261,24 +324,36 @@ NO_LAMP_OPTIONS = LampOptions()
 class LampFiles:
     """Near lamps as given by files and options, before the lights and the images are read."""
 
-    positions: Path | None  # the file of positions, or None if `distance` puts the lamps in the light directions
-    distance: float | None  # see LampOptions, as for the scale. Both of its numbers are None if it is unknown
+    # the file of positions, or None if `distance` puts the lamps in the light directions
+    positions: Path | None
+    # see LampOptions, as for the scale. Both of its numbers are None if it is unknown
+    distance: float | None
     pixel_size: float | None
     object_width: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
     stamp: tuple[Any, ...]  # of the files that were found, from before they were read
-    used: bool  # whether the capture uses the lamps. If not, they are only compared with distant lights
+    # whether the capture uses the lamps. If not, they are only compared with distant lights
+    used: bool
 
     def in_words(self) -> str:
         """Return a description of the source of the lamps' positions."""
         if not self.used:
             return f"{self.positions} is not used"
-        what, width = ("a pixel", self.pixel_size) if self.object_width is None else ("the object", self.object_width)
-        where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
-        return f"{where}; {what} is {width:g} wide" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
+        what, width = (
+            ("a pixel", self.pixel_size)
+            if self.object_width is None
+            else ("the object", self.object_width)
+        )
+        where = (
+            f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
+        )
+        return f"{where}; {what} is {width:g} wide" + (
+            "" if self.lobes is None else f"; lobes as in {self.lobes}"
+        )
 
     def over(self, source: Any, mask: Bools, *, step: int = 1) -> NearLamps | None:
-        """Return all lamps of a CaptureSource over a mask (H, W) of every step-th row and column; None without a scale.
+        """Return all lamps of a CaptureSource over a mask (H, W) of every step-th row and column;
+        None without a scale.
 
         Raises InputError.
         """
@@ -294,23 +369,31 @@ class LampFiles:
         pixel_size = self.pixel_size
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
-            pixel_size = self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
+            pixel_size = (
+                self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
+            )
         if pixel_size is None:
             return None
         shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
-        lobes = None if self.lobes is None else _read_lobes(self.lobes, positions, source.light_frame)
+        lobes = (
+            None if self.lobes is None else _read_lobes(self.lobes, positions, source.light_frame)
+        )
         equal = not source.intensities_measured
-        lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes)
+        lamps = NearLamps.of(
+            positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes
+        )
         left, top, *_ = window.box or (0, 0)
         step *= window.step
-        return lamps.within(left, top, step, None if camera_matrix is None else window.camera(camera_matrix))
+        return lamps.within(
+            left, top, step, None if camera_matrix is None else window.camera(camera_matrix)
+        )
 
 
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
     """Return the near lamps given by the capture's folder and the options; None without any.
 
-    A file of positions in the folder is used, unless the user names a file `lights` of distant lights. Beside such a
-    file, or if the scale is unknown, positions are found but not used.
+    A file of positions in the folder is used, unless the user names a file `lights` of distant
+    lights. Beside such a file, or if the scale is unknown, positions are found but not used.
 
     Raises:
         InputError: a file is wrong, or positions are the only lights and their scale is unknown.
@@ -323,30 +406,44 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             positions = find_named(lights.parent, LIGHT_POSITIONS)
     if positions is None and options.distance is None:
         if options.given is not None:
-            problem = f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
-            raise UsageError(problem, hint="Add --light-positions FILE or --light-distance D, or leave it out")
+            problem = (
+                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
+            )
+            raise UsageError(
+                problem, hint="Add --light-positions FILE or --light-distance D, or leave it out"
+            )
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
     scaled = options.pixel_size is not None or options.object_width is not None
     pixel_file = None if scaled else _find(folders, "pixel_size.txt")
     scaled = scaled or pixel_file is not None
     lobes = _find(folders, "light_lobes.txt")
-    stamp = tuple(stamp_content(path) for path in (positions, pixel_file, lobes) if path is not None)
+    stamp = tuple(
+        stamp_content(path) for path in (positions, pixel_file, lobes) if path is not None
+    )
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
-        hint = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+        hint = (
+            "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+        )
         raise InputError("the scale of the lamp positions is unknown", path=positions, hint=hint)
-    return LampFiles(positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled)
+    return LampFiles(
+        positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled
+    )
 
 
 def find_camera(
     folder: Path, lamps: LampFiles | None, options: LampOptions
 ) -> tuple[Float64Array | None, tuple[Any, ...]]:
-    """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the stamp of its file.
+    """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the
+    stamp of its file.
 
     Raises InputError if the file is wrong.
     """
-    folders = [folder, *([] if lamps is None or lamps.positions is None else [lamps.positions.parent])]
+    folders = [
+        folder,
+        *([] if lamps is None or lamps.positions is None else [lamps.positions.parent]),
+    ]
     path = _path(options.camera_matrix) or _find(folders, "camera_matrix.txt")
     if path is None:
         return None, ()
@@ -363,21 +460,31 @@ def read_camera_matrix(path: Path) -> Float64Array:
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
         problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
-        raise InputError(problem, path=path, hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels")
+        raise InputError(
+            problem,
+            path=path,
+            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
+        )
     ray_basis(matrix)  # rejects other numbers
     return matrix
 
 
 def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float64Array:
     """Return the lobes (F, 4) of NearLamps for lamps at positions (F, 3). Raises InputError."""
-    hint = "A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to 100"
+    hint = (
+        "A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to 100"
+    )
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
-        raise InputError(f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
+        raise InputError(
+            f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint
+        )
     for numbers, line, text in rows:
         # With an exponent of 100, the intensity halves 7 degrees off the axis.
         if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= 100:
-            raise InputError(f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint)
+            raise InputError(
+                f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint
+            )
     rows *= len(positions) // len(rows)
     lobes = np.array([row.numbers for row in rows])
     lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
@@ -385,7 +492,12 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
     if away.any():
         lamp = int(away.argmax())
         hint = "The directions point from the lamps to the object"
-        raise InputError(f"lamp {lamp + 1} shines away from the object", path=path, line=rows[lamp].line, hint=hint)
+        raise InputError(
+            f"lamp {lamp + 1} shines away from the object",
+            path=path,
+            line=rows[lamp].line,
+            hint=hint,
+        )
     return lobes
 
 
@@ -403,4 +515,6 @@ def _read_pixel_size(path: Path) -> float:
 
 
 def _find(folders: list[Path], name: str) -> Path | None:
-    return next((path for folder in folders if (path := find_named(folder, [name])) is not None), None)
+    return next(
+        (path for folder in folders if (path := find_named(folder, [name])) is not None), None
+    )

@@ -12,8 +12,20 @@ from numpy.typing import ArrayLike
 
 from splinecli.capture import linearise, near_lamps
 from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
-from splinecli.capture.files import AMBIENT, CaptureFiles, Overrides, find_named, stamp_content, stamp_files
-from splinecli.capture.formats.facts import UPRIGHT, common_orientation, exposure_factors, read_header
+from splinecli.capture.files import (
+    AMBIENT,
+    CaptureFiles,
+    Overrides,
+    find_named,
+    stamp_content,
+    stamp_files,
+)
+from splinecli.capture.formats.facts import (
+    UPRIGHT,
+    common_orientation,
+    exposure_factors,
+    read_header,
+)
 from splinecli.capture.formats.numbers import NumberRows
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import (
@@ -60,20 +72,22 @@ def open_capture(
 
     Args:
         intensities: a file, or EQUAL.
-        radiometry: how stored values become linear light. Where it names no ambient image, one called `ambient` in the
-            folder is subtracted.
-        white_level: stored value from which an observation is considered saturated, such as 4095 for 12 bits. By
-            default it is found from the files and their values (see WhiteLevel).
+        radiometry: how stored values become linear light. Where it names no ambient image, one
+            called `ambient` in the folder is subtracted.
+        white_level: stored value from which an observation is considered saturated, such as 4095
+            for 12 bits. By default it is found from the files and their values (see WhiteLevel).
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: positions of near lamps, and the camera, unless files in the folder give them.
         find_lights: estimates the lights from the images, instead of reading light files.
-        lights_in_channels: whether the channels of each image are observations under three lights; see ChannelLights.
+        lights_in_channels: whether the channels of each image are observations under three lights;
+            see ChannelLights.
         crosstalk: a file with their crosstalk, instead of that in the folder.
 
     Raises:
-        InputError: find_capture_files does not recognise the folder, a light file is wrong, or the window is not inside
-            the images.
-        UsageError: the white level is not a number above 0, or the object's width is given and a part is read.
+        InputError: find_capture_files does not recognise the folder, a light file is wrong, or the
+            window is not inside the images.
+        UsageError: the white level is not a number above 0, or the object's width is given and a
+            part is read.
 
     Examples:
         >>> from splinecli.capture import open_capture
@@ -87,28 +101,48 @@ def open_capture(
     paths = (None if file is None else Path(file) for file in given)
     overrides = Overrides(*paths, needs_lights=find_lights is None)
     if lamps.positions is not None and lights is not None:
-        raise UsageError("--lights and --light-positions contradict each other", hint="Leave one out")
+        raise UsageError(
+            "--lights and --light-positions contradict each other", hint="Leave one out"
+        )
     form: RowForm = lights_format
-    near = None if find_lights is not None else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
+    near = (
+        None
+        if find_lights is not None
+        else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
+    )
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
-            problem = f"--light-format {lights_format} concerns light directions, but {near.positions} has positions"
-            raise UsageError(problem, hint="Leave it out, or use --light-distance with a file of directions")
+            problem = (
+                f"--light-format {lights_format} concerns light directions, but {near.positions}"
+                " has positions"
+            )
+            raise UsageError(
+                problem, hint="Leave it out, or use --light-distance with a file of directions"
+            )
         overrides, form = replace(overrides, lights=near.positions), "positions"
     if near is not None and near.object_width is not None and window.box is not None:
-        raise UsageError("--object-width needs the whole object in the image", hint="Give --pixel-size beside --crop")
+        raise UsageError(
+            "--object-width needs the whole object in the image",
+            hint="Give --pixel-size beside --crop",
+        )
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
     camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, lamps)
     channels, matrix_file = None, None
     if lights_in_channels:
-        matrix_file = Path(crosstalk) if crosstalk is not None else find_named(files.folder, (CROSSTALK,))
+        matrix_file = (
+            Path(crosstalk) if crosstalk is not None else find_named(files.folder, (CROSSTALK,))
+        )
         channels = channel_lights(matrix_file, len(files.images))
-    stamp = stamp_files(files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera))
+    stamp = stamp_files(
+        files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera)
+    )
     if channels is not None:
         stamp = (*stamp, None if matrix_file is None else stamp_content(matrix_file))
-        files = replace(files, images=tuple(image for image in files.images for _ in range(CHANNELS)))
+        files = replace(
+            files, images=tuple(image for image in files.images for _ in range(CHANNELS))
+        )
     in_folder = files.images
     try:
         files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
@@ -116,10 +150,15 @@ def open_capture(
         if channels is None:
             raise
         problem = error.problem.replace("one for each image", "three for each image")
-        hint = "With --lights-in-channels, the file needs three lines for each image, in the order R, G, B"
+        hint = (
+            "With --lights-in-channels, the file needs three lines for each image, in the order R,"
+            " G, B"
+        )
         raise InputError(problem, path=error.path, hint=hint) from None
     warnings += files.warnings
-    if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
+    if (
+        len(radiometry.flat_field) == len(in_folder) > 1
+    ):  # they are in the order of the folder's images
         flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
         radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
     if equal:
@@ -128,7 +167,9 @@ def open_capture(
         if channels is None:
             found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
         else:  # a line r g b for each image
-            of_images = read_light_intensities(files.light_intensities, len(files.images) // CHANNELS)
+            of_images = read_light_intensities(
+                files.light_intensities, len(files.images) // CHANNELS
+            )
             found_intensities = np.repeat(of_images.reshape(-1, 1), 3, axis=1)
     if channels is not None:
         warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
@@ -145,17 +186,23 @@ def open_capture(
         warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
-        text = f"{files.others[0].name}{more}: left out, because the name is not that of a photograph under one of"
+        text = (
+            f"{files.others[0].name}{more}: left out, because the name is not that of a photograph"
+            " under one of"
+        )
         text += " the lights. To use it as one, list all images in filenames.txt."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve
     # Earlier versions read such images as linear, or those with a colour profile as sRGB.
-    decoded = (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
+    decoded = (
+        (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
+    )
     orientation = common_orientation(facts)
     if orientation != UPRIGHT:
         text = (
-            f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
+            f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask,"
+            " light directions and"
             " results are in the frame of the stored pixels."
         )
         warnings.append(CaptureWarning(codes.EXIF_ORIENTATION, text))
@@ -201,7 +248,12 @@ def read_capture(
         ((11836, 3), (3, 3))
     """
     source = open_capture(
-        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth, white_level=white_level
+        folder,
+        lights=lights,
+        intensities=intensities,
+        mask=mask,
+        ground_truth=ground_truth,
+        white_level=white_level,
     )
     return source.read(light_indices, progress or (lambda: None), as_stored=as_stored)
 
@@ -209,7 +261,9 @@ def read_capture(
 def _read_lights(
     files: CaptureFiles, frame: LightFrame, form: RowForm
 ) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
-    """Return the files in the order of the lights, the directions (F, 3), their intensities (F, 3), and warnings."""
+    """Return the files in the order of the lights, the directions (F, 3), their intensities (F, 3),
+    and warnings.
+    """
     path = files.light_directions
     if path is None:
         return files, placeholders(len(files.images)), None, []
@@ -219,7 +273,10 @@ def _read_lights(
         others = [image.name for image in files.images if image not in images]
         names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
         them = "it" if len(others) == 1 else "them"
-        text = f"{names}: left out, because {path.name} has no light for {them}, and the other images have another"
+        text = (
+            f"{names}: left out, because {path.name} has no light for {them}, and the"
+            " other images have another"
+        )
         text += f" {'size' if len(set(map(_stated_size, files.images))) > 1 else 'form of name'}."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         files = replace(files, images=images)
@@ -227,7 +284,10 @@ def _read_lights(
         return _drop_bad_lights(files, directions, table.intensities, warnings)
     images, how = match_images(table, files.images)
     if len(images) < len(files.images):
-        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others were left out."
+        text = (
+            f"{path.name} names {len(images)} of the {len(files.images)} images; the others were"
+            " left out."
+        )
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."
@@ -236,18 +296,31 @@ def _read_lights(
 
 
 def _drop_bad_lights(
-    files: CaptureFiles, directions: Float64Array, intensities: Float64Array | None, warnings: list[CaptureWarning]
+    files: CaptureFiles,
+    directions: Float64Array,
+    intensities: Float64Array | None,
+    warnings: list[CaptureWarning],
 ) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
-    """Return the arguments without the few lights that are zero or below the horizon; see unit_directions."""
+    """Return the arguments without the few lights that are zero or below the horizon; see
+    unit_directions.
+    """
     good = directions[:, 2] > 0
     if good.all():
         return files, directions, intensities, warnings
-    bad = ", ".join(f"{files.images[light].name} (z = {directions[light, 2]:.2g})" for light in np.flatnonzero(~good))
+    bad = ", ".join(
+        f"{files.images[light].name} (z = {directions[light, 2]:.2g})"
+        for light in np.flatnonzero(~good)
+    )
     assert files.light_directions is not None
-    text = f"{bad}: left out, because its light in {files.light_directions.name} is not above the horizon."
+    text = (
+        f"{bad}: left out, because its light in {files.light_directions.name} is not above the"
+        " horizon."
+    )
     warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     files = replace(
-        files, images=tuple(np.array(files.images, object)[good]), kept=tuple(np.flatnonzero(good).tolist())
+        files,
+        images=tuple(np.array(files.images, object)[good]),
+        kept=tuple(np.flatnonzero(good).tolist()),
     )
     return files, directions[good], None if intensities is None else intensities[good], warnings
 
@@ -257,7 +330,8 @@ def _match_count(
 ) -> tuple[tuple[Path, ...], NumberRows, Float64Array]:
     """Return the images that a light file is for, its rows, and their directions (F, 3).
 
-    These are all images, or else the images of the usual size, or the images whose names differ only in their numbers.
+    These are all images, or else the images of the usual size, or the images whose names differ
+    only in their numbers.
     """
     try:
         return images, *read_lights(path, len(images), frame, form)
@@ -265,14 +339,19 @@ def _match_count(
         for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
             keys = [key(image) for image in images]
             usual = Counter(keys).most_common(1)[0][0]
-            alike = tuple(image for image, of_image in zip(images, keys, strict=True) if of_image == usual)
+            alike = tuple(
+                image for image, of_image in zip(images, keys, strict=True) if of_image == usual
+            )
             if len(alike) < len(images):
                 with suppress(InputError):
                     return alike, *read_lights(path, len(alike), frame, form)
         if not isinstance(error, WrongCountError) or error.n_found >= len(images):
             raise
         names = [image.name for image in images[error.n_found :]]
-        hint = f"In this order, it has none for {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        hint = (
+            "In this order, it has none for"
+            f" {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        )
         raise WrongCountError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
 
 
@@ -281,11 +360,17 @@ def _stated_size(image: Path) -> tuple[int, ...] | None:
     return None if size is None else size[0][:2]
 
 
-def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> Float64Array:
-    """Return the intensities (F, 3) of images from a file with a line for each, or for each image of the folder."""
+def _read_intensities(
+    path: Path, images: Sequence[Path], in_folder: Sequence[Path]
+) -> Float64Array:
+    """Return the intensities (F, 3) of images from a file with a line for each, or for each image
+    of the folder.
+    """
     if len(images) < len(in_folder):
         with suppress(InputError):  # the file is for the chosen images, or wrong in any case
-            return read_light_intensities(path, len(in_folder))[[in_folder.index(image) for image in images]]
+            return read_light_intensities(path, len(in_folder))[
+                [in_folder.index(image) for image in images]
+            ]
     return read_light_intensities(path, len(images))
 
 
@@ -304,39 +389,49 @@ def capture_from_arrays(
     """Return the capture of these images, restored as `infer` restores the capture of a folder.
 
     Args:
-        images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by their full range;
-            floating-point values are taken as they are.
-        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera. None to find them
-            with find_lights.
-        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
-            None takes all pixels.
+        images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by
+            their full range; floating-point values are taken as they are.
+        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
+            None to find them with find_lights.
+        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
+            as in a mask file. None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
-        pixel_size: for near lamps, the width of a pixel on the object; light_directions are then positions in this
-            unit, from the middle of the image on the object's mean plane. None for distant lights.
+        pixel_size: for near lamps, the width of a pixel on the object; light_directions are then
+            positions in this unit, from the middle of the image on the object's mean plane. None
+            for distant lights.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
-            integer images; floating-point images then have none.
-        as_stored: use the values alone. By default, the blur of the lens is removed, saturated observations are
-            restored, and unknown light intensities are estimated.
+        white_level: the value from which an observation is saturated, in the unit of the images.
+            None finds it for integer images; floating-point images then have none.
+        as_stored: use the values alone. By default, the blur of the lens is removed, saturated
+            observations are restored, and unknown light intensities are estimated.
         find_lights: finds the lights from the images, where none are given.
 
     Raises:
         UsageError: a shape or a type does not fit.
-        InputError: a value is not finite or negative, the lights cannot give normals, or the mask is empty.
+        InputError: a value is not finite or negative, the lights cannot give normals, or the mask
+            is empty.
     """
     stack = _checked_images(images)
     shape, n_lights = stack[0].shape[:2], len(stack)
     if light_directions is None and find_lights is None:
         raise UsageError("found neither light directions nor a function that finds them")
     if light_directions is None and pixel_size is not None:
-        raise UsageError("light_directions is None, but near lamps need positions", hint="Leave pixel_size out")
-    directions = placeholders(n_lights) if light_directions is None else _checked_directions(light_directions, n_lights)
+        raise UsageError(
+            "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"
+        )
+    directions = (
+        placeholders(n_lights)
+        if light_directions is None
+        else _checked_directions(light_directions, n_lights)
+    )
     intensities = _checked_intensities(light_intensities, n_lights)
     inside = np.ones(shape, np.bool_) if mask is None else np.array(mask)
     if inside.dtype != np.bool_:  # the rule of mask files for numbers
         inside = inside > max(inside.max(initial=0) / 2, 0)
     if inside.shape != shape:
-        raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
+        raise UsageError(
+            f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images"
+        )
 
     if not inside.any():
         raise InputError("capture: the mask is empty")
@@ -347,10 +442,18 @@ def capture_from_arrays(
         for index, image in enumerate(stack):
             pixels = image if image.ndim == 3 else image[..., None]
             values, path = pixels[inside], Path(f"images[{index}]")
-            used = values if around is None else np.concatenate((values, linearise.take_around(pixels, around)))
-            yield linearise.StoredPixels(path, values, linearise.linear_light(used, path), rgb[index])
+            used = (
+                values
+                if around is None
+                else np.concatenate((values, linearise.take_around(pixels, around)))
+            )
+            yield linearise.StoredPixels(
+                path, values, linearise.linear_light(used, path), rgb[index]
+            )
 
-    observed = linearise.read_observations(read, inside, around, n_lights, white_level, divides_colours=not as_stored)
+    observed = linearise.read_observations(
+        read, inside, around, n_lights, white_level, divides_colours=not as_stored
+    )
     matrix = None if camera_matrix is None else np.asarray(camera_matrix, np.float64)
     capture = Capture(
         "capture",
@@ -367,7 +470,9 @@ def capture_from_arrays(
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
-        lamps = near_lamps.NearLamps.of(positions, pixel_size, shape, equal=not known, camera_matrix=matrix)
+        lamps = near_lamps.NearLamps.of(
+            positions, pixel_size, shape, equal=not known, camera_matrix=matrix
+        )
         warnings = [*observed.warnings, *near_lamps.check_distances(lamps, inside, None)]
         capture = replace(capture, lamps=lamps, camera_matrix=None, warnings=tuple(warnings))
     stored = StoredCapture(capture, observed.saturation, intensities_known=known)
@@ -383,12 +488,26 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
     for index, image in enumerate(stack):
         first = stack[0].shape
         if image.shape != first:
-            raise UsageError(f"found an image of shape {image.shape} at images[{index}], expected {first} as images[0]")
-        if image.ndim not in (2, 3) or not image.size or (image.ndim == 3 and image.shape[2] not in (1, 3)):
-            raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
+            raise UsageError(
+                f"found an image of shape {image.shape} at images[{index}], expected {first} as"
+                " images[0]"
+            )
+        if (
+            image.ndim not in (2, 3)
+            or not image.size
+            or (image.ndim == 3 and image.shape[2] not in (1, 3))
+        ):
+            raise UsageError(
+                f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H,"
+                " W, 3)"
+            )
         if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
-            problem = f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
-            raise UsageError(problem, hint="Convert them with images.astype(...), without a change of scale")
+            problem = (
+                f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
+            )
+            raise UsageError(
+                problem, hint="Convert them with images.astype(...), without a change of scale"
+            )
     return stack
 
 
@@ -412,7 +531,9 @@ def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float6
         values = values[:, None]
     if values.shape not in ((n_lights, 1), (n_lights, 3)):
         shape = values.shape
-        raise UsageError(f"found light intensities of shape {shape}, expected (F,) or (F, 3) with F = {n_lights}")
+        raise UsageError(
+            f"found light intensities of shape {shape}, expected (F,) or (F, 3) with F = {n_lights}"
+        )
     if not (np.isfinite(values) & (values > 0)).all():
         raise InputError("a light intensity is not a finite number above 0")
     return np.broadcast_to(values, (n_lights, 3))

@@ -1,5 +1,5 @@
-"""The capture record that all steps after reading use, the same with stored values, and lights estimated from the
-images."""
+"""The capture record that all steps after reading use, the same with stored values, and lights
+estimated from the images."""
 
 from __future__ import annotations
 
@@ -16,11 +16,25 @@ from splinecli.images.saturation import Saturation, restore_saturated
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.maths.robust import MIN_LIGHTS
-from splinecli.records.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
+from splinecli.records.capture_warnings import (
+    ESTIMATED_INTENSITIES,
+    CaptureWarning,
+    estimated_lights,
+)
 from splinecli.records.white_level import WhiteLevel
 
-_SIDES = ("right", "upper-right", "above", "upper-left", "left", "lower-left", "below", "lower-right")
-SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}  # azimuths, counter-clockwise from the right
+_SIDES = (
+    "right",
+    "upper-right",
+    "above",
+    "upper-left",
+    "left",
+    "lower-left",
+    "below",
+    "lower-right",
+)
+# azimuths, counter-clockwise from the right
+SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}
 ESTIMATE = "estimate"  # given instead of a light file: the lights are estimated from the images
 
 
@@ -34,27 +48,34 @@ class FoundLights:
 
 
 def azimuth_of(first_light: str) -> float:
-    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number. Raises UsageError."""
+    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number.
+    Raises UsageError.
+    """
     try:
         azimuth = SIDES_DEG[first_light] if first_light in SIDES_DEG else float(first_light)
     except ValueError:
         azimuth = np.nan
     if not abs(azimuth) <= 360:
         raise UsageError(
-            f"the first light comes from {first_light!r}; expected one of {', '.join(SIDES_DEG)}, or its azimuth in"
+            f"the first light comes from {first_light!r}; expected one of {', '.join(SIDES_DEG)},"
+            " or its azimuth in"
             " degrees, counter-clockwise from the right"
         )
     return azimuth
 
 
 def placeholders(n_lights: int) -> Float64Array:
-    """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are estimated."""
+    """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are
+    estimated.
+    """
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
 
 LightFinder = Callable[[Float32Array, Bools, bool], FoundLights]
-"""Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""
+"""Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the
+intensities are known.
+"""
 
 _UNIT_TOLERANCE = 1e-3
 _DTYPES: dict[type[np.generic], tuple[str, ...]] = {
@@ -71,33 +92,35 @@ class Capture:
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        observations: (P, F) float32, linear: every channel divided by its light's intensity, then the mean of
-            the channels. Only the mask's pixels, in the mask's row-major order.
+        observations: (P, F) float32, linear: every channel divided by its light's intensity, then
+            the mean of the channels. Only the mask's pixels, in the mask's row-major order.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
-        ground_truth: (H, W, 3) float32 normals, unit, or zero where the ground truth is unknown; or None.
+        ground_truth: (H, W, 3) float32 normals, unit, or zero where the ground truth is unknown; or
+            None.
         warnings: faults that reduce accuracy, and decisions that were made for the user.
-        estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
-            intensities and the images show that they differ; else None.
-        estimated_colours: (F, 3) float64, the colours of the lamps, by which the channels were divided because they
-            differ from image to image; else None.
-        restored: (P, F) bool, true where a saturated observation was replaced by an estimate; None if no observation
-            was restored.
-        white_level: the stored value from which observations were considered saturated; None for floating-point images
-            and for captures that are not read from images.
-        light_errors_deg: (F,) float64, the expected errors of light_directions if they were estimated from the images;
-            else None.
-        removed_blur: the standard deviation in pixels of the blur that was removed from the images; None for none.
-        lamps: the positions of near lamps; light_directions then hold at the origin, the middle of the image on the
-            object's mean plane. None for distant lights.
-        camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic camera. Near lamps
-            have their own.
+        estimated_intensities: (F,) float64, by which the observations were divided because no file
+            gives the light intensities and the images show that they differ; else None.
+        estimated_colours: (F, 3) float64, the colours of the lamps, by which the channels were
+            divided because they differ from image to image; else None.
+        restored: (P, F) bool, true where a saturated observation was replaced by an estimate; None
+            if no observation was restored.
+        white_level: the stored value from which observations were considered saturated; None for
+            floating-point images and for captures that are not read from images.
+        light_errors_deg: (F,) float64, the expected errors of light_directions if they were
+            estimated from the images; else None.
+        removed_blur: the standard deviation in pixels of the blur that was removed from the images;
+            None for none.
+        lamps: the positions of near lamps; light_directions then hold at the origin, the middle of
+            the image on the object's mean plane. None for distant lights.
+        camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic
+            camera. Near lamps have their own.
 
     Raises:
-        InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
-            horizon, there are fewer than three lights or all are coplanar, the mask is empty, or the camera matrix is
-            invalid.
+        InputError: the shapes disagree, a value is not finite, a light is not a unit vector above
+            the horizon, there are fewer than three lights or all are coplanar, the mask is empty,
+            or the camera matrix is invalid.
         UsageError: the camera matrix is not 3 x 3.
     """
 
@@ -118,12 +141,17 @@ class Capture:
     camera_matrix: Float64Array | None = None
 
     def __post_init__(self) -> None:
-        # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
+        # The record is frozen, so its fields get their dtypes here; those that have them are not
+        # copied.
         for dtype, names in _DTYPES.items():
             for name in names:
                 values = getattr(self, name)
-                object.__setattr__(self, name, None if values is None else np.asarray(values, dtype))
-        object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
+                object.__setattr__(
+                    self, name, None if values is None else np.asarray(values, dtype)
+                )
+        object.__setattr__(
+            self, "light_indices", tuple(operator.index(i) for i in self.light_indices)
+        )
         object.__setattr__(self, "warnings", tuple(self.warnings))
         self._check_lights()
         self._check_pixels()
@@ -141,8 +169,8 @@ class Capture:
     def choose_lights(self, positions: Sequence[int]) -> Capture:
         """Return the same capture under some of its lights, in the order given.
 
-        The positions are zero-based, among this record's lights. Raises the errors of check_light_indices, and
-        InputError if the chosen lights are coplanar.
+        The positions are zero-based, among this record's lights. Raises the errors of
+        check_light_indices, and InputError if the chosen lights are coplanar.
         """
         chosen = list(check_light_indices(positions, self.n_lights))
         return replace(
@@ -150,15 +178,23 @@ class Capture:
             observations=self.observations[:, chosen],
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
-            estimated_intensities=None if self.estimated_intensities is None else self.estimated_intensities[chosen],
-            estimated_colours=None if self.estimated_colours is None else self.estimated_colours[chosen],
+            estimated_intensities=None
+            if self.estimated_intensities is None
+            else self.estimated_intensities[chosen],
+            estimated_colours=None
+            if self.estimated_colours is None
+            else self.estimated_colours[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
             lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
-            light_errors_deg=None if self.light_errors_deg is None else self.light_errors_deg[chosen],
+            light_errors_deg=None
+            if self.light_errors_deg is None
+            else self.light_errors_deg[chosen],
         )
 
     def choose_pixels(self, positions: Integers) -> Capture:
-        """Return the same capture with some of its pixels, from their rising zero-based positions in this record."""
+        """Return the same capture with some of its pixels, from their rising zero-based positions
+        in this record.
+        """
         mask = np.zeros_like(self.mask)
         # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
         mask.flat[np.flatnonzero(self.mask)[positions]] = True
@@ -173,11 +209,17 @@ class Capture:
     def _check_lights(self) -> None:
         lights = self.light_directions
         if lights.ndim != 2 or lights.shape[1] != 3:
-            raise InputError(f"{self.name}: light directions of shape {lights.shape}, expected (F, 3)")
+            raise InputError(
+                f"{self.name}: light directions of shape {lights.shape}, expected (F, 3)"
+            )
         if len(self.light_indices) != len(lights):
-            raise InputError(f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights")
+            raise InputError(
+                f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights"
+            )
         if len(lights) < MIN_LIGHTS:
-            hint = "A normal has three unknowns, so three images under different lights are the fewest"
+            hint = (
+                "A normal has three unknowns, so three images under different lights are the fewest"
+            )
             found = "1 light" if len(lights) == 1 else f"{len(lights)} lights"
             raise InputError(f"{self.name}: {found}, expected at least {MIN_LIGHTS}", hint=hint)
         self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
@@ -191,8 +233,13 @@ class Capture:
             problem = f"{self.name}: light {below} is below the horizon (z <= 0)"
             raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
-            problem = f"{self.name}: the {len(lights)} lights are in one plane, so least squares (LS) cannot solve"
-            raise InputError(f"{problem} for a normal", hint="Choose lights that surround the viewing direction")
+            problem = (
+                f"{self.name}: the {len(lights)} lights are in one plane, so least squares (LS)"
+                " cannot solve"
+            )
+            raise InputError(
+                f"{problem} for a normal", hint="Choose lights that surround the viewing direction"
+            )
 
     def _check_pixels(self) -> None:
         if self.mask.ndim != 2:
@@ -200,8 +247,12 @@ class Capture:
         n_pixels = int(np.count_nonzero(self.mask))
         if n_pixels == 0:
             raise InputError(f"{self.name}: the mask is empty")
-        self._check_shape("observations", self.observations, (n_pixels, self.n_lights), "(pixels, lights) = ")
-        self._check_shape("restored flags", self.restored, (n_pixels, self.n_lights), "(pixels, lights) = ")
+        self._check_shape(
+            "observations", self.observations, (n_pixels, self.n_lights), "(pixels, lights) = "
+        )
+        self._check_shape(
+            "restored flags", self.restored, (n_pixels, self.n_lights), "(pixels, lights) = "
+        )
         if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
             raise InputError(f"{self.name}: an observation is not finite")
         self._check_shape("ground truth", self.ground_truth, (*self.mask.shape, 3), "(H, W, 3) = ")
@@ -209,11 +260,17 @@ class Capture:
             length = np.linalg.norm(block, axis=1)
             # In this form, NaN fails the check, too.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
-                raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
+                raise InputError(
+                    f"{self.name}: a ground-truth normal is neither a unit vector nor zero"
+                )
 
-    def _check_shape(self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = "") -> None:
+    def _check_shape(
+        self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = ""
+    ) -> None:
         if array is not None and array.shape != shape:
-            raise InputError(f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}")
+            raise InputError(
+                f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}"
+            )
 
 
 def in_one_plane(light_directions: Float64Array) -> bool:
@@ -225,7 +282,8 @@ def in_one_plane(light_directions: Float64Array) -> bool:
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
     """Return the indices as a tuple of ints, in their order.
 
-    Raises UsageError if an index is repeated or not below n_lights, or if there are fewer than three.
+    Raises UsageError if an index is repeated or not below n_lights, or if there are fewer than
+    three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):
@@ -254,33 +312,49 @@ def name_reading(*, as_stored: bool) -> str:
 class StoredCapture:
     """A capture as its files store it, with the data needed to restore it.
 
-    `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
-    lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
-    level of a choice is decided from its images alone.
+    `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights
+    once, chooses the lights of each draw, and restores each choice by itself, so that both commands
+    see the same observations. The white level of a choice is decided from its images alone.
     """
 
     capture: Capture  # linear observations, divided by the light intensities that the files give
     saturation: Saturation
-    intensities_known: bool  # whether a file, an option or the image format gives the light intensities
-    found_intensities: Float64Array | None = None  # (F,), estimated together with the directions, or None
+    # whether a file, an option or the image format gives the light intensities
+    intensities_known: bool
+    # (F,), estimated together with the directions, or None
+    found_intensities: Float64Array | None = None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
         """Return the capture under lights that are estimated from these observations.
 
-        Raises InputError if the images do not determine the lights, or the estimated lights cannot give normals.
+        Raises InputError if the images do not determine the lights, or the estimated lights cannot
+        give normals.
         """
         capture = self.capture
         try:
             found = find(capture.observations, capture.mask, self.intensities_known)
         except InputError as error:
             raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
-        warnings, directions = (*capture.warnings, estimated_lights(found.errors_deg)), found.directions
-        capture = replace(capture, light_directions=directions, light_errors_deg=found.errors_deg, warnings=warnings)
+        warnings, directions = (
+            (*capture.warnings, estimated_lights(found.errors_deg)),
+            found.directions,
+        )
+        capture = replace(
+            capture,
+            light_directions=directions,
+            light_errors_deg=found.errors_deg,
+            warnings=warnings,
+        )
         return replace(self, capture=capture, found_intensities=found.intensities)
 
     def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
-        """Return the capture under some of its lights, with arrays of its own, but the warnings of all lights."""
-        capture, saturation = self.capture.choose_lights(positions), self.saturation.choose_images(positions)
+        """Return the capture under some of its lights, with arrays of its own, but the warnings of
+        all lights.
+        """
+        capture, saturation = (
+            self.capture.choose_lights(positions),
+            self.saturation.choose_images(positions),
+        )
         if saturation.white_level != capture.white_level:
             capture = replace(capture, white_level=saturation.white_level)
         found = None if self.found_intensities is None else self.found_intensities[list(positions)]
@@ -288,16 +362,25 @@ class StoredCapture:
 
     def choose_pixels(self, rows: Integers) -> StoredCapture:
         """Return the capture with these rising rows of its observations, with arrays of its own."""
-        return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
+        return replace(
+            self,
+            capture=self.capture.choose_pixels(rows),
+            saturation=self.saturation.choose_pixels(rows),
+        )
 
     def estimate_intensities(self) -> Float64Array | None:
-        """Return light intensities (F,) estimated from all pixels; None if they are known or assumed equal."""
+        """Return light intensities (F,) estimated from all pixels; None if they are known or
+        assumed equal.
+        """
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
-        return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
+        return estimate_light_intensities(
+            self.capture.observations, self.saturation.flags, self._lights_of
+        )
 
     def restore(self, intensities: Float64Array | None) -> Capture:
-        """Return the capture with its intensities divided out and its saturated observations restored.
+        """Return the capture with its intensities divided out and its saturated observations
+        restored.
 
         The observations are changed in place: this record must not be used afterwards.
         """
@@ -307,22 +390,34 @@ class StoredCapture:
             lowest, highest = intensities.min(), intensities.max()
             digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
             text = (
-                f"The light intensities were estimated from the images: they are unequal, from {lowest:.{digits}f} to"
-                f" {highest:.{digits}f} times their mean. Use --intensities FILE if you have measured them, or"
+                "The light intensities were estimated from the images: they are unequal, from"
+                f" {lowest:.{digits}f} to"
+                f" {highest:.{digits}f} times their mean. Use --intensities FILE if you"
+                " have measured them, or"
                 " --intensities equal to assume equal ones."
             )
             warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
         saturated = self.saturation.flags
-        restored = None if saturated is None else restore_saturated(observations, saturated, self._lights_of)
+        restored = (
+            None
+            if saturated is None
+            else restore_saturated(observations, saturated, self._lights_of)
+        )
         if intensities is None and restored is None:
             return self.capture
-        return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)
+        return replace(
+            self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored
+        )
 
     def _lights_of(self, rows: Integers) -> Float64Array:
-        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near lamps on a plane."""
+        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near
+        lamps on a plane.
+        """
         lamps = self.capture.lamps
         if lamps is None:
             return self.capture.light_directions
         places = np.flatnonzero(self.capture.mask)[rows]
-        directions, attenuation = lamps.light_at(lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1])))
+        directions, attenuation = lamps.light_at(
+            lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1]))
+        )
         return np.asarray(directions * attenuation[..., None], np.float64)

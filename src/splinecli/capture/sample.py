@@ -9,6 +9,7 @@ from splinecli.maths import Bools, Floats
 class Sample:
     """Observations on a grid of pixels."""
 
-    observations: Floats  # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
+    # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
+    observations: Floats
     mask: Bools  # (h, w) bool with p true pixels
     step: int  # rows and columns of the images from one pixel of the grid to the next

@@ -1,1 +1,3 @@
-"""The command line: the only place with typer, rich, printing and exit codes. It begins in main.py."""
+"""The command line: the only place with typer, rich, printing and exit codes.
+It begins in main.py.
+"""

@@ -22,46 +22,53 @@ if TYPE_CHECKING:
 def calibrate(options: CalibrateOptions) -> None:
     """Measure light directions from images of mirror balls.
 
-    A BALL is a folder with one image for each light, in the order of the lights. The outline of the ball comes from
-    --circle or a mask (--mask, or a file named mask in the folder). Otherwise it is detected in an image named ref, or
-    in the mean of all images. The brightest spot in the ball is taken as the lamp. Directions of
-    several balls are averaged.
+    A BALL is a folder with one image for each light, in the order of the lights. The outline of the
+    ball comes from --circle or a mask (--mask, or a file named mask in the folder). Otherwise it is
+    detected in an image named ref, or in the mean of all images. The brightest spot in the ball is
+    taken as the lamp. Directions of several balls are averaged.
 
-    Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
-    calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.
-    If the lamps are near, the camera is known, and there are at least two balls or one ball at two places, it also
-    writes light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
+    Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the
+    result by eye, and calibration.json. With a gray ball or card, it also writes
+    light_intensities.txt, the relative light intensities. If the lamps are near, the camera is
+    known, and there are at least two balls or one ball at two places, it also writes
+    light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
     from splinecli.pipeline.calibrate import DIRECTIONS, calibrate_lights
 
     report = calibrate_lights(options, Messages(quiet=options.quiet))
-    print_report(report, str(options.output / DIRECTIONS), as_json=options.as_json, quiet=options.quiet)
+    print_report(
+        report, str(options.output / DIRECTIONS), as_json=options.as_json, quiet=options.quiet
+    )
 
 
 def integrate(options: IntegrateOptions) -> None:
     """Integrate a normal map to a depth map and a mesh.
 
-    Uses bilateral normal integration. The surface may break at edges, where the normals do not fit together. Without a
-    camera matrix, the depth map has heights towards the camera in pixels, with mean zero. With one, it has depths
-    along the viewing axis, of unknown scale.
+    Uses bilateral normal integration. The surface may break at edges, where the normals do not fit
+    together. Without a camera matrix, the depth map has heights towards the camera in pixels, with
+    mean zero. With one, it has depths along the viewing axis, of unknown scale.
 
-    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object,
-    depth.png and surface.json.
+    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN
+    outside the object, depth.png and surface.json.
     """
     from splinecli.pipeline.integrate import integrate_normal_map, summary_line
 
     report = integrate_normal_map(options, Messages(quiet=options.quiet))
-    print_report(report, summary_line(options, report), as_json=options.as_json, quiet=options.quiet)
+    print_report(
+        report, summary_line(options, report), as_json=options.as_json, quiet=options.quiet
+    )
 
 
 def evaluate(options: EvaluateOptions) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 
-    All methods use the same draws. Captures are read as infer reads them; --as-stored reproduces published tables.
+    All methods use the same draws. Captures are read as infer reads them; --as-stored reproduces
+    published tables.
 
-    Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT, and a plot if you
-    give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more
-    trials, methods or lights. A capture that cannot be scored is skipped with a message, and the exit code is then 3.
+    Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT,
+    and a plot if you give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the
+    command again to go on, or with more trials, methods or lights. A capture that cannot be scored
+    is skipped with a message, and the exit code is then 3.
     """
     from splinecli.pipeline.evaluate import evaluate_captures
 
@@ -82,7 +89,10 @@ def evaluate(options: EvaluateOptions) -> int:
         for evaluation in outcome.evaluations:
             _print_table(evaluation)
         for relit in outcome.document.get("relighting", ()):
-            kinds = [f"{kind} {relit[kind]['psnr_db']:.1f} dB" for kind in ("material", "lambertian", "nearest")]
+            kinds = [
+                f"{kind} {relit[kind]['psnr_db']:.1f} dB"
+                for kind in ("material", "lambertian", "nearest")
+            ]
             lights = f"from {len(relit['lights'])} lights"
             print(f"relighting {relit['capture']} {lights}, {relit['method']}: {', '.join(kinds)}")
     return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
@@ -99,9 +109,15 @@ def _print_table(evaluation: Evaluation) -> None:
 
     rows = table_rows(evaluation)
     best = best_cells(rows)
-    cells = [[Text(cell, "bold" if (r, c) in best else "") for c, cell in enumerate(row)] for r, row in enumerate(rows)]
+    cells = [
+        [Text(cell, "bold" if (r, c) in best else "") for c, cell in enumerate(row)]
+        for r, row in enumerate(rows)
+    ]
     console = Console(highlight=False)
-    if sum(max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0]))) > console.width:
+    if (
+        sum(max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0])))
+        > console.width
+    ):
         cells = [list(column) for column in zip(*cells, strict=True)]
     table = Table(box=box.SIMPLE_HEAD)
     for column, name in enumerate(cells[0]):
@@ -117,34 +133,43 @@ def _print_table(evaluation: Evaluation) -> None:
 def prepare(options: PrepareOptions) -> int:
     """Make a pixel set, the training data of `splinecli train SET`.
 
-    A pixel set has the true normal of each pixel and its observations under all lights. Writes SET/manifest.json, a
-    folder for each capture and scene, and the overview SET/contact_sheet.png. The same command continues after an
-    interruption, and adds to an existing set. Captures that cannot be read are reported and skipped. Rendering needs
-    the extra 'render'.
+    A pixel set has the true normal of each pixel and its observations under all lights. Writes
+    SET/manifest.json, a folder for each capture and scene, and the overview SET/contact_sheet.png.
+    The same command continues after an interruption, and adds to an existing set. Captures that
+    cannot be read are reported and skipped. Rendering needs the extra 'render'.
     """
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.workshop.prepare import prepare_pixel_set
 
     summary = prepare_pixel_set(options, Messages(quiet=options.quiet))
     in_words = (
-        f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
+        f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes,"
+        f" {summary['n_pixels']} pixels,"
         f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"
     )
-    print_report(summary, *([in_words] if summary["entries"] else []), as_json=options.as_json, quiet=options.quiet)
+    print_report(
+        summary,
+        *([in_words] if summary["entries"] else []),
+        as_json=options.as_json,
+        quiet=options.quiet,
+    )
     return worst_exit_code(capture["exit_code"] for capture in summary["skipped"])
 
 
 def import_weights(options: ImportOptions) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 
-    Other commands take the weight file with --weights. Both checkpoints must come from the same training
-    step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in them is not run.
+    Other commands take the weight file with --weights. Both checkpoints must come from the same
+    training step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in
+    them is not run.
     """
     output = options.output
     if output.is_dir():
         raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")
     if output.exists() and not options.overwrite:
-        raise OutputError("exists already", path=output, hint="Add --overwrite, or choose another place with -o")
+        raise OutputError(
+            "exists already", path=output, hint="Add --overwrite, or choose another place with -o"
+        )
 
     from splinecli.estimate.networks.weights import save_weights
     from splinecli.workshop.import_weights import import_official
@@ -158,9 +183,10 @@ def train(options: TrainOptions) -> None:
     """Train LI-Net and NE-Net, or with --preset refine a refinement net.
 
     Without a SET, the pixels are generated during training; a refinement net needs a SET. Writes
-    weights.safetensors, which --weights of other commands takes, checkpoint.safetensors, config.json, metrics.csv,
-    curves.png and maps.png into RUN. After Ctrl-C, --resume continues from the checkpoint. Settings come from the
-    preset, then from --config, then from the other options. With torchrun, several processes train together.
+    weights.safetensors, which --weights of other commands takes, checkpoint.safetensors,
+    config.json, metrics.csv, curves.png and maps.png into RUN. After Ctrl-C, --resume continues
+    from the checkpoint. Settings come from the preset, then from --config, then from the other
+    options. With torchrun, several processes train together.
     """
     from splinecli.workshop.training.config import parse_parameter, parse_sources
     from splinecli.workshop.training.loop import configure_run, open_run
@@ -173,13 +199,19 @@ def train(options: TrainOptions) -> None:
     changes += [parse_parameter(text) for text in options.param]
     if options.seed is not None:
         changes.append({"seed": options.seed})
-    settings, resume = configure_run(options.output, options.preset, options.config, changes, resume=options.resume)
+    settings, resume = configure_run(
+        options.output, options.preset, options.config, changes, resume=options.resume
+    )
     if options.steps is not None:
         settings = replace(settings, steps=options.steps, minutes=0.0)
     if options.minutes is not None:
         settings = replace(settings, minutes=options.minutes)
     messages = Messages(quiet=options.quiet)
-    how: dict[str, Any] = {"resume": resume, "tensorboard": options.tensorboard, "observer": messages}
+    how: dict[str, Any] = {
+        "resume": resume,
+        "tensorboard": options.tensorboard,
+        "observer": messages,
+    }
     with open_run(settings, options.output, options.device, **how) as trainer:
         _run(trainer, Messages(quiet=options.quiet or not trainer.workers.leads))
         if not options.quiet and trainer.workers.leads:
@@ -189,12 +221,17 @@ def train(options: TrainOptions) -> None:
 def _run(trainer: Trainer, messages: Messages) -> None:
     if single := trainer.task.sets.single_scene_sets:
         names = ", ".join(single)
-        messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")
+        messages.warn(
+            f"{names}: the set has a single scene, so training and validation use the same pixels"
+        )
     if trainer.workers.leads and trainer.log.set_aside:
         messages.warn(f"metrics.csv was damaged and is now {trainer.log.set_aside}")
     shown = trainer.progress
     if shown >= 1:
-        messages.say(f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes to go on.")
+        messages.say(
+            f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes"
+            " to go on."
+        )
     with messages.progress("training", 1.0, start=shown) as advance:
 
         def report(progress: float, metrics: Metrics) -> None:
@@ -209,7 +246,16 @@ def _run(trainer: Trainer, messages: Messages) -> None:
 
 
 def _losses(metrics: Metrics) -> str:
-    """Return the losses in words. Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg in validation"."""
-    validation = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg in validation"
+    """Return the losses in words. Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg
+    in validation".
+    """
+    validation = (
+        ""
+        if metrics.validation_deg is None
+        else f", {metrics.validation_deg:.2f} deg in validation"
+    )
     on_map = "" if metrics.map_error is None else f" map {metrics.map_error:.3f},"
-    return f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f},{on_map} {metrics.angle_deg:.2f} deg{validation}"
+    return (
+        f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f},{on_map} {metrics.angle_deg:.2f}"
+        f" deg{validation}"
+    )

@@ -1,8 +1,9 @@
 """Output for users and programs: reports, messages, tables and progress.
 
-Each error becomes one message and an exit code and, with JSON output, also a document. Typer and click change the names
-of their parser errors, such as an unknown option or a word instead of a number, from version to version. We therefore
-rely only on the attributes of these errors. An error without a known attribute keeps its text.
+Each error becomes one message and an exit code and, with JSON output, also a document. Typer and
+click change the names of their parser errors, such as an unknown option or a word instead of a
+number, from version to version. We therefore rely only on the attributes of these errors. An error
+without a known attribute keeps its text.
 """
 
 import json
@@ -22,8 +23,10 @@ from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer, ignore
 
-DEFECT = "this is a defect of splinecli; please report it with the lines above."  # for unexpected errors
-# Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
+# for unexpected errors
+DEFECT = "this is a defect of splinecli; please report it with the lines above."
+# Typer carries its own copy of click, in a place that changes with the version. This is click's
+# base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for invalid arguments
 # Click's texts as regular expressions, and the words that replace them
 _SYNTAX = (
@@ -34,7 +37,11 @@ _SYNTAX = (
     (r"^Missing command\.?$", "a command is missing"),
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
-RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}  # options of earlier versions
+# options of earlier versions
+RENAMED = {
+    "--stiffness": "--discontinuity",
+    "--lights-format": "--light-format",
+}
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -58,10 +65,14 @@ def error_document(error: Exception) -> dict[str, Any]:
 
 
 @contextmanager
-def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that prints the documents of `infer`, one for each capture, as soon as the capture is finished.
+def printed_documents(
+    *, as_list: bool, as_lines: bool
+) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Yield a function that prints the documents of `infer`, one for each capture, as soon as the
+    capture is finished.
 
-    Each document is a line, or an item of a single list. An error that ends the command is printed last.
+    Each document is a line, or an item of a single list. An error that ends the command is printed
+    last.
     """
     is_empty = True
 
@@ -85,7 +96,9 @@ def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[di
 
 
 def _usage_message(error: Any) -> str:
-    """Return the message for click's usage error, with the value found, the value expected, and a pointer to help."""
+    """Return the message for click's usage error, with the value found, the value expected, and a
+    pointer to help.
+    """
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
     text = _unknown_name(error) or error.format_message()
@@ -106,7 +119,11 @@ def _unknown_name(error: Any) -> str | None:
     if option and hasattr(error, "possibilities"):
         return f"no option {option}.{suggestion(sorted(error.possibilities or ()))}"
     command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
-    return f"no command {command[1]}.{suggestion((command[2] or '').strip('?').split(', '))}" if command else None
+    return (
+        f"no command {command[1]}.{suggestion((command[2] or '').strip('?').split(', '))}"
+        if command
+        else None
+    )
 
 
 LINE_SECONDS = 30.0  # seconds between two progress lines if stderr is not a terminal
@@ -165,7 +182,9 @@ class Messages(Observer):
         Console(stderr=True, markup=False, highlight=False).print(table)
 
     @contextmanager
-    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
+    def progress(
+        self, label: str, total: float, *, start: float = 0.0, unit: str = ""
+    ) -> Iterator[Advance]:
         if self.quiet:
             yield ignore
         elif sys.stderr.isatty():
@@ -187,7 +206,11 @@ class Messages(Observer):
                 speed = (done - start) / (now - began)
                 notes = [_in_words(speed, unit)] if unit else []
                 notes += [f"{(total - done) / speed:.0f} s left"] if speed else []
-                self.say(", ".join((f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))))
+                self.say(
+                    ", ".join(
+                        (f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))
+                    )
+                )
 
         return advance
 
@@ -211,7 +234,9 @@ def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]
     )
     # A summary for a file or a pipe must not be written to the progress bar's stream.
     own = sys.stdout.isatty()
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=own) as bar:
+    with Progress(
+        *columns, console=Console(stderr=True), transient=True, redirect_stdout=own
+    ) as bar:
         task = bar.add_task(printable(label), total=total, note="", speed="")
         bar.update(task, completed=start)
 

@@ -25,20 +25,26 @@ if TYPE_CHECKING:
     )
     from splinecli.results.pages import Row
 
-_WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the last line, for these outcomes
+# of the last line, for these outcomes
+_WORDS = {
+    "skipped": "already done",
+    "changed": "changed but kept",
+}
 
 
-def infer(context: Context, options: InferOptions, batch: BatchOptions, cluster: ClusterOptions) -> int:
+def infer(
+    context: Context, options: InferOptions, batch: BatchOptions, cluster: ClusterOptions
+) -> int:
     """Estimate the normal map of each CAPTURE.
 
-    A CAPTURE is a folder with images of one object, taken by a fixed camera under different lights. The light file is
-    in the folder, or is given by --lights. With --lights estimate, a CAPTURE may be a film. Writes
-    OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if there is ground truth. With several
-    captures, OUT/index.html links the results.
+    A CAPTURE is a folder with images of one object, taken by a fixed camera under different lights.
+    The light file is in the folder, or is given by --lights. With --lights estimate, a CAPTURE may
+    be a film. Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if
+    there is ground truth. With several captures, OUT/index.html links the results.
 
-    Captures that are already done are skipped. If files or options of a capture have changed, infer reports this and
-    keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
-    The most serious failure determines the exit code.
+    Captures that are already done are skipped. If files or options of a capture have changed, infer
+    reports this and keeps the old results. --update or --overwrite computes them again. A capture
+    that fails does not stop the others. The most serious failure determines the exit code.
     """
     from splinecli.pipeline.batch import infer_batch
 
@@ -88,7 +94,11 @@ def _show_all(
         if rows:
             columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
             messages.table(list(zip(*columns, strict=True)))
-        text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
+        text = ", ".join(
+            f"{statuses[name]} {_WORDS.get(name, name)}"
+            for name in get_args(Status)
+            if statuses[name]
+        )
         messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
     return worst_exit_code(codes)
 
@@ -106,16 +116,20 @@ def _summary(report: dict[str, Any], output: Path) -> str:
         condition = "" if judged else " if the lights and the images are right"
         scored = f", {expected:.0%} of them likely within 5 deg{condition}"
     counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
-    return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"
+    return (
+        f"{output / report['capture']}: {counts}, {report['method']}{scored},"
+        f" {report['seconds']['total']:.1f} s"
+    )
 
 
 def watch(context: Context, options: WatchOptions) -> None:
     """Run infer on each capture that arrives in FOLDER, once it is complete.
 
-    A capture is a subfolder of FOLDER, or a film with --lights estimate. Each one is processed as infer does with
-    OPTIONS. Captures that are already done are skipped, so the command can be stopped and started again at any time. It
-    continues after a capture fails, and tries that capture again when its files change. If FOLDER vanishes, the command
-    waits for it. Ctrl-C or SIGTERM ends the command, with exit code 130.
+    A capture is a subfolder of FOLDER, or a film with --lights estimate. Each one is processed as
+    infer does with OPTIONS. Captures that are already done are skipped, so the command can be
+    stopped and started again at any time. It continues after a capture fails, and tries that
+    capture again when its files change. If FOLDER vanishes, the command waits for it. Ctrl-C or
+    SIGTERM ends the command, with exit code 130.
     """
     from splinecli.pipeline.incoming import Arrivals
 
@@ -124,14 +138,20 @@ def watch(context: Context, options: WatchOptions) -> None:
     run = infer.make_context("infer", [*options.options, "--", str(folder)], parent=context.parent)
     given, output = run.params, run.params["output"].expanduser()
     if given["as_json"]:
-        raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
+        raise UsageError(
+            "--json prints one list at the end, and watch has none", hint="Give --jsonl"
+        )
     if given["shard"] is not None:
         hint = "Watch one folder for each shard"
         raise UsageError("--shard splits a list of captures, and watch has none", hint=hint)
     if len(given["captures"]) > 1:
-        raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
+        raise UsageError(
+            f"found {given['captures'][0]} after the dashes, expected options of infer"
+        )
     if output.resolve() == folder.resolve():
-        raise UsageError("the results would be among the captures", path=output, hint="Give another -o OUT")
+        raise UsageError(
+            "the results would be among the captures", path=output, hint="Give another -o OUT"
+        )
     given["captures"] = []
     infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=options.marker, seconds=options.settle, without=output)
@@ -158,9 +178,9 @@ def watch(context: Context, options: WatchOptions) -> None:
 def info(reading: Reading, options: InfoOptions) -> int:
     """Describe CAPTURE as `infer` would read it, without estimating normals.
 
-    Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
-    the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing
-    but the plot and the mended lights.
+    Prints the layout and files of the capture, the size and bit depth of the images, their white
+    level and exposure, the angles of the lights from the camera axis, and the memory and time that
+    infer needs. Writes nothing but the plot and the mended lights.
     """
     from splinecli.pipeline.info import describe_capture, summary_lines
     from splinecli.records.capture_warnings import PROBABLY_WRONG
@@ -170,6 +190,9 @@ def info(reading: Reading, options: InfoOptions) -> int:
     print_report(report, *summary_lines(report), as_json=options.as_json, quiet=options.quiet)
     wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
     if reading.strict and wrong:
-        messages.error(f"{options.capture}: an input is probably wrong ({', '.join(wrong)}), as the warnings say.")
+        messages.error(
+            f"{options.capture}: an input is probably wrong ({', '.join(wrong)}), as the warnings"
+            " say."
+        )
         return InputError.exit_code
     return 0

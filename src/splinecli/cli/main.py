@@ -1,4 +1,6 @@
-"""The Typer app, and the entry point, which turns every error into an exit code. Importing it must stay cheap."""
+"""The Typer app, and the entry point, which turns every error into an exit code. Importing it must
+stay cheap.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,15 @@ from typer.core import TyperCommand, TyperGroup
 
 from splinecli._version import __version__
 from splinecli.cli.commands import calibrate, evaluate, import_weights, integrate, prepare, train
-from splinecli.cli.console import DEFECT, Messages, ParserError, error_document, explain, print_lines, printed_documents
+from splinecli.cli.console import (
+    DEFECT,
+    Messages,
+    ParserError,
+    error_document,
+    explain,
+    print_lines,
+    printed_documents,
+)
 from splinecli.cli.infer import infer, info, watch
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.records.base import (
@@ -46,15 +56,19 @@ from splinecli.system.machine import check_address_space, keep_freed_memory
 
 
 def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
-    """Return a function for Typer that accepts the options of a function's records, and calls it with the records.
+    """Return a function for Typer that accepts the options of a function's records, and calls it
+    with the records.
 
-    The module defines the records. It is imported here, so that it does not slow down the help of other commands.
+    The module defines the records. It is imported here, so that it does not slow down the help of
+    other commands.
     """
     records: dict[str, type[Record]] = {}
     parameters = []
     for name, kind in get_type_hints(function, localns=vars(import_module(module))).items():
         if kind is Context:
-            parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind))
+            parameters.append(
+                inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind)
+            )
         elif name != "return":
             records[name] = kind
     options = [option for record in records.values() for option in _options(record)]
@@ -89,9 +103,13 @@ def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
 
 
 def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Parameter:
-    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and lists."""
+    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and
+    lists.
+    """
     typed, metavar, complete = plain(kind), option.metavar, option.complete
-    choices = next((get_args(part) for part in (typed, *get_args(typed)) if get_origin(part) is Literal), ())
+    choices = next(
+        (get_args(part) for part in (typed, *get_args(typed)) if get_origin(part) is Literal), ()
+    )
     if choices:
         metavar, complete = "|".join(choices), choices
     elif option.items:
@@ -116,22 +134,34 @@ def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Pa
     else:
         names = option.names or (long_name(name, option),)
         shown = True if option.default is None else option.default
-        info = TyperOption(*names, metavar=metavar, show_default=shown, rich_help_panel=option.panel, **common)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, info])
+        info = TyperOption(
+            *names, metavar=metavar, show_default=shown, rich_help_panel=option.panel, **common
+        )
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, info]
+    )
 
 
 def _offer(names: Collection[str]) -> Callable[[], list[str]]:
     return lambda: list(names)
 
 
-INFER, JSON = "infer", "--json"  # the command whose JSON is a list of documents, and the option that asks for it
+# the command whose JSON is a list of documents, and the option that asks for it
+INFER, JSON = (
+    "infer",
+    "--json",
+)
 
 _FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
     "splinecli.pipeline.infer_options": (infer, watch, info),
     "splinecli.pipeline.options": (calibrate, integrate, evaluate),
     "splinecli.workshop.options": (prepare, train, import_weights),
 }
-COMMANDS = {each.__name__.replace("_", "-"): (each, module) for module, part in _FUNCTIONS.items() for each in part}
+COMMANDS = {
+    each.__name__.replace("_", "-"): (each, module)
+    for module, part in _FUNCTIONS.items()
+    for each in part
+}
 """Name of a command -> its function, and the module that declares its options."""
 
 
@@ -148,12 +178,24 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute, creating it now if it depends on the options, because their imports are slow."""
-        return getattr(self._made, name) if name in ("params", "callback") else super().__getattribute__(name)
+        """Return an attribute, creating it now if it depends on the options, because their imports
+        are slow.
+        """
+        return (
+            getattr(self._made, name)
+            if name in ("params", "callback")
+            else super().__getattribute__(name)
+        )
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments. The context is added to parser errors, so that the message names the command."""
-        wants_json, wants_lines = JSON in args, "--jsonl" in args  # the parser removes them from the list
+        """Parse the arguments. The context is added to parser errors, so that the message names the
+        command.
+        """
+        # the parser removes them from the list
+        wants_json, wants_lines = (
+            JSON in args,
+            "--jsonl" in args,
+        )
         try:
             return super().parse_args(ctx, args)
         except ParserError as error:
@@ -181,23 +223,36 @@ class Command(TyperCommand):
             keep_freed_memory()
             if ctx.info_name != INFER:
                 return run()
-            with printed_documents(as_list=ctx.params["as_json"], as_lines=ctx.params["as_json_lines"]) as ctx.obj:
+            with printed_documents(
+                as_list=ctx.params["as_json"], as_lines=ctx.params["as_json_lines"]
+            ) as ctx.obj:
                 return run()
         except Exception as error:
-            if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
+            if (
+                ctx.params.get("as_json")
+                and ctx.info_name != INFER
+                and not isinstance(error, typer.Exit | typer.Abort)
+            ):
                 print(json.dumps(error_document(error), indent=2))
             raise
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions of a word, each with one line of help: shells treat a second line as another word."""
+        """Return the completions of a word, each with one line of help: shells treat a second line
+        as another word.
+        """
         items = super().shell_complete(ctx, incomplete)
         for item in items:  # Typer breaks the help beside an option at 80 columns
             item.help = textwrap.shorten(item.help or "", 72, placeholder=" ...")
         return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line, without the braces that Typer puts around arguments."""
-        return [piece.translate({ord(brace): None for brace in "{}"}) for piece in super().collect_usage_pieces(ctx)]
+        """Return the parts of the usage line, without the braces that Typer puts around
+        arguments.
+        """
+        return [
+            piece.translate({ord(brace): None for brace in "{}"})
+            for piece in super().collect_usage_pieces(ctx)
+        ]
 
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option --help, in the panel of the output."""
@@ -234,8 +289,14 @@ class Commands(TyperGroup):
 app = typer.Typer(
     name="splinecli",
     cls=Commands,
-    help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
-    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
+    help=(
+        "Surface normals from a few photographs under known lights (photometric stereo with"
+        " SPLINE-Net)."
+    ),
+    epilog=(
+        "Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output,"
+        " 130 interrupted."
+    ),
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -251,7 +312,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _splinecli(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+        bool,
+        typer.Option(
+            "--version", help="Print the version and exit.", is_eager=True, callback=_print_version
+        ),
     ] = False,
 ) -> None:
     pass
@@ -262,14 +326,18 @@ for _name, (_function, _) in COMMANDS.items():
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
+    """Run `splinecli ARGS` and return the exit code (the contract is in
+    docs/files-and-frames.md).
+    """
     _repair_streams()
-    # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy with other work this
-    # takes cores from the thread that computes. PyTorch reads the variable when it is first imported.
+    # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy
+    # with other work this takes cores from the thread that computes. PyTorch reads the variable
+    # when it is first imported.
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     logging.disable()  # logs of libraries, such as Dask, are not meant for users
-    warnings.filterwarnings("ignore", module="distributed")  # about other versions on workers. See Work.enter
+    # about other versions on workers. See Work.enter
+    warnings.filterwarnings("ignore", module="distributed")
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)
@@ -280,7 +348,9 @@ def main(args: Sequence[str] | None = None) -> int:
 def _run_command(args: Sequence[str] | None) -> int:
     command, messages = typer.main.get_command(app), Messages(quiet=False)
     try:
-        result = command.main(args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False)
+        result = command.main(
+            args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
+        )
     except KeyboardInterrupt:
         result = INTERRUPTED
     except Exception as error:
@@ -296,9 +366,11 @@ def _run_command(args: Sequence[str] | None) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed. All other attributes are the stream's.
+    """A text stream that drops all output once its pipe is closed. All other attributes are the
+    stream's.
 
-    With a plain stream, the next line that a command prints would raise an error and end the command's work.
+    With a plain stream, the next line that a command prints would raise an error and end the
+    command's work.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -339,8 +411,8 @@ def _repair_streams() -> None:
 def _apart(stream: TextIO) -> TextIO:
     """Return the stream stderr with a file descriptor of its own.
 
-    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see native_stderr). With
-    its own descriptor, other threads can still print in the meantime.
+    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see
+    native_stderr). With its own descriptor, other threads can still print in the meantime.
     """
     if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != 2:
         return stream
@@ -349,4 +421,6 @@ def _apart(stream: TextIO) -> TextIO:
         own = os.fdopen(os.dup(2), "wb", buffering=0)
     except OSError:  # a limit on open files; the command reports it
         return stream
-    return io.TextIOWrapper(own, stream.encoding, stream.errors, line_buffering=True, write_through=True)
+    return io.TextIOWrapper(
+        own, stream.encoding, stream.errors, line_buffering=True, write_through=True
+    )

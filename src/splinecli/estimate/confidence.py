@@ -1,7 +1,8 @@
 """Correct the errors that a network predicts, using residuals of the whole capture.
 
-A single pixel does not allow wrong lights or values to be distinguished from an unusual reflectance. Many pixels do:
-errors of calibration follow the lights, the place in the image, or the brightness in the same way everywhere.
+A single pixel does not allow wrong lights or values to be distinguished from an unusual
+reflectance. Many pixels do: errors of calibration follow the lights, the place in the image, or the
+brightness in the same way everywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -20,18 +21,28 @@ from splinecli.maths.pixel_grid import Blocks
 from splinecli.maths.robust import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.system.machine import side_by_side
 
-FEWEST_LIGHTS, FEWEST_PIXELS = 5, 50  # with fewer, the residuals of a fit are not enough to assess a capture
+# with fewer, the residuals of a fit are not enough to assess a capture
+FEWEST_LIGHTS, FEWEST_PIXELS = (
+    5,
+    50,
+)
 _FITS = 4
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
 def correct_errors(
-    capture: Capture, estimator: Estimator, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array
+    capture: Capture,
+    estimator: Estimator,
+    lighting_at: LightingAt,
+    normals: Float32Array,
+    errors: Float32Array,
 ) -> bool:
-    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether that was possible.
+    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether that
+    was possible.
 
-    It is impossible if the capture is too small, or if the correction was not made for the estimator's weights. A pixel
-    that is dark under every light stays as it is. `lighting_at` gives the light of some pixels.
+    It is impossible if the capture is too small, or if the correction was not made for the
+    estimator's weights. A pixel that is dark under every light stays as it is. `lighting_at` gives
+    the light of some pixels.
     """
     import torch
 
@@ -62,8 +73,9 @@ def correct_errors(
 def add_common_error(errors: Float32Array, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
-    Wrong lights or values rotate the normals together. The medians of both errors are added like the medians of
-    independent errors, and the shape approaches the shape of the common error where that error is the larger one.
+    Wrong lights or values rotate the normals together. The medians of both errors are added like
+    the medians of independent errors, and the shape approaches the shape of the common error where
+    that error is the larger one.
     """
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
@@ -75,27 +87,34 @@ def add_common_error(errors: Float32Array, error_deg: float) -> None:
 class CaptureFeatures(NamedTuple):
     """Numbers that describe how well a capture fits the assumptions. NaN is unknown.
 
-    Misfits are logs of a matte surface's residuals, as a share of the brightness and a median over pixels; a
-    turn is the log of the median angle in degrees by which normals would rotate.
+    Misfits are logs of a matte surface's residuals, as a share of the brightness and a median over
+    pixels; a turn is the log of the median angle in degrees by which normals would rotate.
     """
 
     misfit: float  # with the estimated normals
     free_misfit: float  # with those that fit best
-    rank_residual: float  # log of the residual of all images after the best fit of three free images to this capture
+    # log of the residual of all images after the best fit of three free images to this capture
+    rank_residual: float
     light_misfit: float  # log of how far the lights are from those three
     free_light_misfit: float  # the same with any intensities
-    decoding: float  # log of the share of the residual that remains after decoding the values once more
-    nearness: float  # of lamps as near as they appear in the images: the width of the object over their distance
+    # log of the share of the residual that remains after decoding the values once more
+    decoding: float
+    # of lamps as near as they appear in the images: the width of the object over their distance
+    nearness: float
     near_share: float  # the share of the residual that it explains
     near_turn: float
-    bend: float  # the log of an exponent of the values; it rotates normals only below 1, as encoded values have
+    # the log of an exponent of the values; it rotates normals only below 1, as encoded values have
+    bend: float
     bend_share: float
     bend_turn: float
     curl: float  # log of the curl of the normals over their derivatives
-    rim: float  # |cosine| between normals and the outward direction at a steep outline: 1 for a ball and for a bowl
+    # |cosine| between normals and the outward direction at a steep outline: 1 for a ball and for a
+    # bowl
+    rim: float
     lights: float  # log of their number
     spread: float  # how well they determine a normal
-    difference: float  # log of the median angle in degrees between the estimated normals and those that fit best
+    # log of the median angle in degrees between the estimated normals and those that fit best
+    difference: float
     expected: float  # mean logarithm of the expected errors
     shadow: float  # share of shadowed observations
     dark: float  # share of dark pixels
@@ -108,10 +127,15 @@ class PixelScale:
     bright: float  # brightness of a bright pixel
     middle: tuple[float, float]  # row and column of the middle of the object
     width: float  # of the object, in pixels
-    turning: Float64Array  # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
+    # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
+    turning: Float64Array
 
-    def features(self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers) -> Float64Array:
-        """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near lamps in degrees."""
+    def features(
+        self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers
+    ) -> Float64Array:
+        """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near
+        lamps in degrees.
+        """
         places = self.places(rows, columns)
         turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
         turn -= np.einsum("pk,pk->p", turn, normals)[:, None] * normals
@@ -124,17 +148,24 @@ class PixelScale:
 
 
 def capture_features(
-    mask: Bools, lighting_at: LightingAt, normals: Float32Array, errors: Float32Array, lights: Float64Array
+    mask: Bools,
+    lighting_at: LightingAt,
+    normals: Float32Array,
+    errors: Float32Array,
+    lights: Float64Array,
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
-    The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py. Lights are (F, 3),
-    unit; of near lamps, at the origin. `lighting_at` gives the light of some pixels.
+    The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py.
+    Lights are (F, 3), unit; of near lamps, at the origin. `lighting_at` gives the light of some
+    pixels.
     """
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
         return None
-    rows = np.arange(0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
+    rows = np.arange(
+        0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2))
+    )
     light = lighting_at(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
@@ -146,7 +177,9 @@ def capture_features(
     own = normals[rows][kept].astype(np.float64)
     if light.directions.ndim == 3:  # convert the values of matte pixels to distant lights
         directions = light.in_frame_of_capture(light.directions)[kept]
-        scaled = fit_scaled_normals(values, (values > LIT_SHARE).astype(np.float64), directions.astype(np.float64))
+        scaled = fit_scaled_normals(
+            values, (values > LIT_SHARE).astype(np.float64), directions.astype(np.float64)
+        )
         values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
         values = np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
     lit = (values > LIT_SHARE).astype(np.float64)
@@ -160,7 +193,8 @@ def capture_features(
     difference = angle_between_deg(own, best)
 
     def explain(terms: Float64Array, sign: int) -> tuple[float, float, float]:
-        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its rotation.
+        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of
+        its rotation.
 
         An amount of the other sign is not such a fault, and does not rotate any normals.
         """
@@ -178,8 +212,11 @@ def capture_features(
     middle = float(row.mean()), float(column.mean())
     scale = PixelScale(bright, middle, float(np.sqrt(len(normals))), np.zeros((3, 3, 2)))
     at = scale.places(row, column)
-    # To first order in width over distance, observations under near lamps are n.l (1 + 3 l.x) - n.x.
-    near = explain(3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True), 1)
+    # To first order in width over distance, observations under near lamps are n.l (1 + 3 l.x) -
+    # n.x.
+    near = explain(
+        3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True), 1
+    )
     bend = explain(values * np.log(values.clip(min=0.01)), -1)
     features = CaptureFeatures(
         _log_median((np.abs(left) * lit).sum(axis=1) / shaded),
@@ -195,7 +232,8 @@ def capture_features(
         shadow=float(1 - lit.mean()),
         dark=float(1 - kept.mean()),
     )
-    # By how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)
+    # By how much lamps at a distance of one width change a normal (3,), over the normal (3,) and
+    # place (2,)
     solve = np.linalg.pinv(lights)
     turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
     for axis in range(2):
@@ -210,12 +248,16 @@ def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
 def _residuals_under(
     normals: Float64Array, values: Float64Array, lit: Float64Array, lights: Float64Array
 ) -> Float64Array:
-    """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and any albedo."""
+    """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and any
+    albedo.
+    """
     cosines = (normals @ lights.T).clip(min=0)
     seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain
     weights = seen
     for _ in range(_FITS):
-        albedo = (weights * values * cosines).sum(axis=1) / (weights * cosines**2).sum(axis=1).clip(min=1e-6)
+        albedo = (weights * values * cosines).sum(axis=1) / (weights * cosines**2).sum(axis=1).clip(
+            min=1e-6
+        )
         left = values - albedo[:, None] * cosines
         weights = seen * absolute_weights(left)
     return np.asarray(left)
@@ -233,7 +275,9 @@ def _of_factors(values: Float64Array, lights: Float64Array) -> tuple[float, floa
     rank = float(np.log(factors.residual + _LEAST_SHARE))
     if decoded is None:
         return rank, known, free, np.nan
-    before, after = (np.hypot(each.misfits(lights[None])[0], each.residual) for each in (factors, decoded))
+    before, after = (
+        np.hypot(each.misfits(lights[None])[0], each.residual) for each in (factors, decoded)
+    )
     return rank, known, free, float(np.log(after / max(before, _LEAST_SHARE)))
 
 

@@ -1,12 +1,14 @@
-"""From a Capture and an Estimator to a NormalEstimate, and the surface from which near lamps light each pixel.
+"""From a Capture and an Estimator to a NormalEstimate, and the surface from which near lamps light
+each pixel.
 
-The surface determines the direction and the attenuation of each near lamp's light at each pixel. To find it, fit
-normals, integrate them, move the pixels onto the surface, and fit again with the light directions and the
-inverse-square falloff that the lamps have there. The surface begins as the object's mean plane. (Logothetis et al., "A
-CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate in the same way.)
+The surface determines the direction and the attenuation of each near lamp's light at each pixel. To
+find it, fit normals, integrate them, move the pixels onto the surface, and fit again with the light
+directions and the inverse-square falloff that the lamps have there. The surface begins as the
+object's mean plane. (Logothetis et al., "A CNN based approach for the point-light photometric
+stereo problem", arXiv 2210.04655, alternate in the same way.)
 
-If the estimator has a refiner, light from other parts of the object is removed first, and the map is refined. Pixels
-are processed in tiles, so that only the results grow with the capture.
+If the estimator has a refiner, light from other parts of the object is removed first, and the map
+is refined. Pixels are processed in tiles, so that only the results grow with the capture.
 """
 
 import time
@@ -38,27 +40,35 @@ from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Clock, Progress, ignore
 
-PIXELS_ON_THE_WAY = 40_000  # larger captures are fitted at about this size: fine detail hardly moves the surface
+# larger captures are fitted at about this size: fine detail hardly moves the surface
+PIXELS_ON_THE_WAY = 40_000
 
 
 def find_surface(capture: Capture) -> Capture:
-    """Return the capture with the points of its surface. With points already, or distant lights, it is unchanged."""
+    """Return the capture with the points of its surface. With points already, or distant lights, it
+    is unchanged.
+    """
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
-    estimator = make_estimator("iw12")  # the intermediate fit: fast, and robust against shadows and highlights
+    # the intermediate fit: fast, and robust against shadows and highlights
+    estimator = make_estimator("iw12")
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, lighting.flat_depth(lamps))
-    # Intermediate fits. An error of the surface only matters as a share of the distance of the lamps, so few are
-    # enough.
+    # Intermediate fits. An error of the surface only matters as a share of the distance of the
+    # lamps, so few are enough.
     for _ in range(2):
         points = lighting.surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = PixelLighting.of(observations, replace(lamps, points=points))
-        normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
+        normals = light.in_frame_of_capture(
+            estimator.estimate(light.observations, light.directions)
+        )
         normal_map = np.zeros((*blocks.mask.shape, 3))
         normal_map[blocks.mask] = normals
-        depth = integrate_normals(normal_map, blocks.mask, blocks.shrink_camera(lamps.camera_matrix))
+        depth = integrate_normals(
+            normal_map, blocks.mask, blocks.shrink_camera(lamps.camera_matrix)
+        )
         if lamps.camera_matrix is None:
             depth *= blocks.step  # from blocks to pixels
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
@@ -72,11 +82,12 @@ class NormalEstimate:
 
     normal_map: (H, W, 3) float32, unit inside the mask and zero outside.
     seconds: time spent on the estimation.
-    error_map_deg: (H, W) float32, NaN at pixels without ground truth; None if the capture has no ground truth.
-    errors: summary of error_map_deg, or None.
-    confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG; zero outside the
-        mask. None if the method has no confidence.
-    capture_judged: whether the confidence also covers how well the whole capture fits its lights and its values.
+    error_map_deg: (H, W) float32, NaN at pixels without ground truth; None if the capture has no
+    ground truth. errors: summary of error_map_deg, or None.
+    confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG;
+        zero outside the mask. None if the method has no confidence.
+    capture_judged: whether the confidence also covers how well the whole capture fits its lights
+    and its values.
     """
 
     capture: Capture
@@ -89,7 +100,9 @@ class NormalEstimate:
 
     @property
     def expected_under_5(self) -> float | None:
-        """Expected share of pixels whose normals are off by at most 5 degrees; None without confidence."""
+        """Expected share of pixels whose normals are off by at most 5 degrees; None without
+        confidence.
+        """
         if self.confidence_map is None:
             return None
         return float(self.confidence_map[self.capture.mask].mean())
@@ -102,11 +115,12 @@ def estimate_normals(
     progress: Progress = ignore,
     clock: Clock | None = None,
 ) -> NormalEstimate:
-    """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
+    """Estimate the normals of a capture. Under near lamps, find its surface first (see
+    find_surface).
 
-    The capture of the result has the points of this surface. `progress` is called with the number of pixels just
-    finished, after each batch of the estimator. The clock times the stages that follow, and shows them. Raises
-    SplinecliError if the normals are not unit vectors.
+    The capture of the result has the points of this surface. `progress` is called with the number
+    of pixels just finished, after each batch of the estimator. The clock times the stages that
+    follow, and shows them. Raises SplinecliError if the normals are not unit vectors.
 
     Examples:
         >>> from splinecli.capture import read_capture
@@ -131,34 +145,48 @@ def estimate_normals(
     normal_map[capture.mask] = normals
     del normals
     if capture.ground_truth is None:
-        return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged)
+        return NormalEstimate(
+            capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged
+        )
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
-    return NormalEstimate(capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged)
+    return NormalEstimate(
+        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged
+    )
 
 
 def _estimate(
     capture: Capture, estimator: Estimator, progress: Progress, clock: Clock
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
-    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover the whole capture.
+    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover
+    the whole capture.
 
     Methods without confidence have no distributions.
     """
-    found = estimate_pixels(capture.mask, capture.observations, lighting_on(capture), estimator, progress, clock)
+    found = estimate_pixels(
+        capture.mask, capture.observations, lighting_on(capture), estimator, progress, clock
+    )
     normals, errors = found.normals, found.errors
     refiner = estimator.refiner
     if refiner is not None and errors is not None:
         advance = clock.begin("refine", capture.n_pixels, "refining")
-        refiner.refine(capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance)
-    judged = errors is not None and correct_errors(capture, estimator, found.lighting_at, normals, errors)
+        refiner.refine(
+            capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance
+        )
+    judged = errors is not None and correct_errors(
+        capture, estimator, found.lighting_at, normals, errors
+    )
     if errors is not None:
-        found_lights = [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
+        found_lights = (
+            [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
+        )
         for error_deg in (*found_lights, *(warning.error_deg for warning in capture.warnings)):
             if error_deg:
                 add_common_error(errors, error_deg)
     return normals, errors, judged
 
 
-_TILE_VALUES = 1 << 24  # the most numbers, observations and directions, that an estimator gets at once
+# the most numbers, observations and directions, that an estimator gets at once
+_TILE_VALUES = 1 << 24
 
 
 class PixelEstimates(NamedTuple):
@@ -166,7 +194,8 @@ class PixelEstimates(NamedTuple):
 
     normals: (P, 3) float32, unit, in the capture's frame.
     errors: (P, 2) float32, the distributions of their errors; None for methods without confidence.
-    lighting_at: the light of the pixels as used for the last estimate: without indirect light where that was removed.
+    lighting_at: the light of the pixels as used for the last estimate: without indirect light where
+    that was removed.
     """
 
     normals: NDArray[np.float32]
@@ -182,14 +211,17 @@ def estimate_pixels(
     progress: Progress = ignore,
     clock: Clock | None = None,
 ) -> PixelEstimates:
-    """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated again without it.
+    """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated
+    again without it.
 
-    Only the networks with a refiner remove indirect light. The refinement net also learns from these estimates.
+    Only the networks with a refiner remove indirect light. The refinement net also learns from
+    these estimates.
 
     Args:
         mask: (H, W), with P true pixels.
         observations: (P, F), as they were photographed.
-        lighting_without: gives the light of some pixels without the given indirect light; None removes nothing.
+        lighting_without: gives the light of some pixels without the given indirect light; None
+            removes nothing.
         progress, clock: see estimate_normals.
     """
     clock, n_pixels = clock or Clock(), len(observations)
@@ -197,7 +229,9 @@ def estimate_pixels(
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
     def estimate(pixels: PixelIndices, light: PixelLighting, progress: Progress = ignore) -> None:
-        found, of_pixels = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
+        found, of_pixels = estimator.estimate_with_error(
+            light.observations, light.directions, progress=progress
+        )
         if errors is not None:
             errors[pixels] = of_pixels
         normals[pixels] = light.in_frame_of_capture(found)
@@ -206,7 +240,9 @@ def estimate_pixels(
     refiner = estimator.refiner
     # Directions that differ from pixel to pixel are computed in float64.
     each = 1 if lighting_at(np.arange(1)).directions.ndim == 2 else 10
-    tile_pixels = min(estimator.tile_pixels, max(TILE_PIXELS, _TILE_VALUES // (each * observations.shape[1])))
+    tile_pixels = min(
+        estimator.tile_pixels, max(TILE_PIXELS, _TILE_VALUES // (each * observations.shape[1]))
+    )
     estimator = estimator.bind(lighting_at, mask)
     for pixels in parts_of_pixels(n_pixels, tile_pixels):
         estimate(pixels, lighting_at(pixels), progress)
@@ -227,8 +263,14 @@ def estimate_pixels(
 
 
 def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndices], PixelLighting]:
-    """Return a function for the light of some of a capture's pixels: see `lighting_without` of estimate_pixels."""
-    lamps, directions, camera_matrix = capture.lamps, capture.light_directions, capture.camera_matrix
+    """Return a function for the light of some of a capture's pixels: see `lighting_without` of
+    estimate_pixels.
+    """
+    lamps, directions, camera_matrix = (
+        capture.lamps,
+        capture.light_directions,
+        capture.camera_matrix,
+    )
     places = PixelPlaces(capture.mask)
 
     def lighting_without(indirect: IndirectLight | None, pixels: PixelIndices) -> PixelLighting:
@@ -239,13 +281,17 @@ def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndice
             return PixelLighting.of(observations, lamps.choose_pixels(pixels))
         if camera_matrix is None:
             return PixelLighting(observations, directions)
-        return PixelLighting.distant(observations, directions, rays_at(*places.places(pixels), camera_matrix))
+        return PixelLighting.distant(
+            observations, directions, rays_at(*places.places(pixels), camera_matrix)
+        )
 
     return lighting_without
 
 
 def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the confidence (P,) from distributions of errors (P, 2), without further arrays of their size."""
+    """Return the confidence (P,) from distributions of errors (P, 2), without further arrays of
+    their size.
+    """
     found = np.empty(len(errors), np.float32)
     for start in range(0, len(errors), TILE_PIXELS):
         found[start : start + TILE_PIXELS] = confidence(errors[start : start + TILE_PIXELS])
@@ -256,5 +302,7 @@ def _check_unit(normals: NDArray[np.float32], method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
-        if not (np.abs(length - 1) <= 1e-2).all():  # accepts float16 and bfloat16, rejects zero vectors and NaN
+        if not (
+            np.abs(length - 1) <= 1e-2
+        ).all():  # accepts float16 and bfloat16, rejects zero vectors and NaN
             raise SplinecliError(f"method {method} gave normals that are not unit vectors")

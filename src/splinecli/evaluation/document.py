@@ -1,6 +1,8 @@
-"""The files that an evaluation writes: results.json, results.csv, tables, plots, and a report as one HTML file.
+"""The files that an evaluation writes: results.json, results.csv, tables, plots, and a report as
+one HTML file.
 
-All functions take one evaluation, or several with the same methods that differ in n_lights, light_noise_deg or both.
+All functions take one evaluation, or several with the same methods that differ in n_lights,
+light_noise_deg or both.
 """
 
 import csv
@@ -20,20 +22,30 @@ from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
 from splinecli.evaluation.tables import AVERAGE, compare, table_rows
-from splinecli.records.documents import ComparisonReport, MethodResult, ProtocolReport, RelightingReport
+from splinecli.records.documents import (
+    ComparisonReport,
+    MethodResult,
+    ProtocolReport,
+    RelightingReport,
+)
 from splinecli.records.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
 
 _MOST_SENTENCES = 3  # pairs, as with three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
-_RESTORED = "lens blur removed, saturated observations restored, unknown light intensities estimated, as infer does"
+_RESTORED = (
+    "lens blur removed, saturated observations restored, unknown light intensities estimated, as"
+    " infer does"
+)
 _AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
 Mark = Literal["", "star", "best"]
 
 
 class Cell(NamedTuple):
-    """A table's cell: its text, a remark in smaller type, and a mark. "best" adds a star and a colour."""
+    """A table's cell: its text, a remark in smaller type, and a mark. "best" adds a star and a
+    colour.
+    """
 
     text: str
     remark: str = ""
@@ -43,11 +55,14 @@ class Cell(NamedTuple):
 Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 
 
-def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:
-    """Return the report of one evaluation, or of several that differ in the lights or the light noise.
+def html_report(
+    evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
+) -> str:
+    """Return the report of one evaluation, or of several that differ in the lights or the light
+    noise.
 
-    `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are sentences about the
-    captures.
+    `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are
+    sentences about the captures.
     """
     first, captures = evaluations[0], _captures(evaluations)
     return render(
@@ -68,10 +83,13 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     first = evaluations[0].protocol
     lights = dict.fromkeys(f"{lights_value(e.protocol)} lights" for e in evaluations)
     noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
-    drawn = "at random from the seed" if first.draws_file is None else f"as in {first.draws_file.name}"
+    drawn = (
+        "at random from the seed" if first.draws_file is None else f"as in {first.draws_file.name}"
+    )
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
     left_out = ", ".join(
-        f"the first {count} of {'every other capture' if name == protocol_module.EVERY_CAPTURE else name}"
+        f"the first {count} of"
+        f" {'every other capture' if name == protocol_module.EVERY_CAPTURE else name}"
         for name, count in first.skip_first.items()
     )
     everything = "all that have ground truth"
@@ -104,7 +122,9 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
         "heading": heading(evaluation.protocol),
         "errors": _error_table(evaluation),
         "seconds": _seconds_table(evaluation),
-        "sentences": [tables.in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
+        "sentences": [tables.in_words(c) for c in average]
+        if len(average) <= _MOST_SENTENCES
+        else [],
         "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
         "pairs": [_pair_row(c) for c in comparisons],
     }
@@ -114,12 +134,16 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
     """Return a table of methods by evaluations, the last columns of their tables."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
-        columns.append([Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])])
+        columns.append(
+            [Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])]
+        )
     return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _error_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures and the average: MAE and its standard deviation over the trials."""
+    """Return a table of methods by captures and the average: MAE and its standard deviation over
+    the trials.
+    """
     header, *rows = table_rows(evaluation)
     best = tables.best_cells([header, *rows])
     maes_deg = {(r.method, r.capture): r.maes_deg for r in evaluation.results}
@@ -128,7 +152,11 @@ def _error_table(evaluation: Evaluation) -> Table:
         trials = [maes_deg[method, capture] for capture in evaluation.captures]
         trials.append(tables.trial_averages(evaluation, method))
         cells = [
-            Cell(value, f"± {np.std(maes):.2f}" if len(maes) > 1 else "", "best" if (r, c) in best else "")
+            Cell(
+                value,
+                f"± {np.std(maes):.2f}" if len(maes) > 1 else "",
+                "best" if (r, c) in best else "",
+            )
             for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
         ]
         body.append([Cell(method), *cells])
@@ -138,20 +166,30 @@ def _error_table(evaluation: Evaluation) -> Table:
 def _seconds_table(evaluation: Evaluation) -> Table:
     seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
     body = [
-        [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
+        [
+            Cell(method),
+            *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures),
+        ]
         for method in evaluation.methods
     ]
     return [[Cell("method"), *(Cell(printable(capture)) for capture in evaluation.captures)], *body]
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[ComparisonReport]) -> Table:
-    """Return a table of MAE differences, row method minus column method; significant ones are marked."""
+    """Return a table of MAE differences, row method minus column method; significant ones are
+    marked.
+    """
     cells = {}
     for c in comparisons:
-        for row, column, difference in ((c.first, c.second, c.difference_deg), (c.second, c.first, -c.difference_deg)):
+        for row, column, difference in (
+            (c.first, c.second, c.difference_deg),
+            (c.second, c.first, -c.difference_deg),
+        ):
             mark: Mark = "" if not c.differs else "best" if difference < 0 else "star"
             cells[row, column] = Cell(_signed(difference), mark=mark)
-    body = [[Cell(row), *(cells.get((row, column), Cell("")) for column in methods)] for row in methods]
+    body = [
+        [Cell(row), *(cells.get((row, column), Cell("")) for column in methods)] for row in methods
+    ]
     return [[Cell("method"), *(Cell(method) for method in methods)], *body]
 
 
@@ -161,7 +199,11 @@ def _pair_row(c: ComparisonReport) -> dict[str, str]:
     else:
         interval = " to ".join(map(_signed, c.interval_deg))
         p_value = tables.p_in_words(c.p_holm)
-    verdict = {None: "", True: f"{c.first if c.difference_deg < 0 else c.second} is better", False: "no"}
+    verdict = {
+        None: "",
+        True: f"{c.first if c.difference_deg < 0 else c.second} is better",
+        False: "no",
+    }
     return {
         "capture": c.capture,
         "pair": f"{c.first} {_MINUS} {c.second}",
@@ -173,8 +215,15 @@ def _pair_row(c: ComparisonReport) -> dict[str, str]:
 
 
 def _figure(caption: str, png: bytes) -> dict[str, Any]:
-    width, height = struct.unpack(">II", png[16:24])  # from the IHDR chunk, which always comes first
-    return {"caption": caption, "url": picture_url(png), "width": width, "height": height, "wide": width > 2 * height}
+    # from the IHDR chunk, which always comes first
+    width, height = struct.unpack(">II", png[16:24])
+    return {
+        "caption": caption,
+        "url": picture_url(png),
+        "width": width,
+        "height": height,
+        "wide": width > 2 * height,
+    }
 
 
 def _signed(value_deg: float) -> str:
@@ -193,14 +242,19 @@ TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json"
 
 
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
-    """Return plots of the error against each setting that varies, as captions and PNGs by file name."""
+    """Return plots of the error against each setting that varies, as captions and PNGs by file
+    name.
+    """
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
         return plots
     if len({evaluation.protocol.n_lights for evaluation in evaluations}) > 1:
         plots[LIGHT_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
     if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
-        plots[LIGHT_NOISE_PLOT] = ("Error against the light noise.", light_noise_curves(evaluations))
+        plots[LIGHT_NOISE_PLOT] = (
+            "Error against the light noise.",
+            light_noise_curves(evaluations),
+        )
     return plots
 
 
@@ -210,9 +264,11 @@ def write_results(
     figures: Sequence[CaptureFigure] | None,
     relit: Sequence[RelightingReport] | None = None,
 ) -> dict[str, Any]:
-    """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the folder.
+    """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the
+    folder.
 
-    If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of results.json.
+    If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of
+    results.json.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
     if relit is not None:
@@ -241,9 +297,9 @@ def write_results(
 def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Return the content of results.json. Degrees and seconds have four decimals.
 
-    With several evaluations, `protocol` lists the values in which they differ, and `averages` has an entry for each
-    evaluation under each method, by the same values: {"ls": {"10": 16.1, "all": 15.4}}. p-values have three
-    significant digits.
+    With several evaluations, `protocol` lists the values in which they differ, and `averages` has
+    an entry for each evaluation under each method, by the same values: {"ls": {"10": 16.1, "all":
+    15.4}}. p-values have three significant digits.
     """
     return {
         "schema": 1,
@@ -251,15 +307,21 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
         "results": _records(evaluations),
         "averages": _averages(evaluations),
-        "comparisons": [_rounded(c.as_dict()) for evaluation in evaluations for c in compare(evaluation)],
+        "comparisons": [
+            _rounded(c.as_dict()) for evaluation in evaluations for c in compare(evaluation)
+        ],
         "skipped": [skipped.as_dict() for skipped in protocol_module.all_skipped(evaluations)],
-        "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)),
+        "notes": list(
+            dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)
+        ),
         "version": __version__,
     }
 
 
 def results_csv(evaluations: Sequence[Evaluation]) -> str:
-    """Return a header and a line for each result, with the names and values of `results` in results.json."""
+    """Return a header and a line for each result, with the names and values of `results` in
+    results.json.
+    """
     text = io.StringIO()
     records = _records(evaluations)
     for record in records:
@@ -271,7 +333,9 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _as_text_cell(value: Any) -> Any:
-    """Return a value as a one-line cell; an apostrophe marks it as text if a spreadsheet could read a formula."""
+    """Return a value as a one-line cell; an apostrophe marks it as text if a spreadsheet could read
+    a formula.
+    """
     if not isinstance(value, str):
         return value
     text = printable(value)
@@ -300,7 +364,9 @@ def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
     names = MethodResult.__struct_fields__
     pairs = [(result, e.protocol) for e in evaluations for result in e.results]
     return [
-        _rounded({name: getattr(result if hasattr(result, name) else protocol, name) for name in names})
+        _rounded(
+            {name: getattr(result if hasattr(result, name) else protocol, name) for name in names}
+        )
         for result, protocol in pairs
     ]
 
@@ -315,7 +381,10 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
     keys = [", ".join(values) for values in zip(*differing, strict=True)]
     methods = dict.fromkeys(method for average in averages for method in average)
-    return {method: {key: average[method] for key, average in zip(keys, averages, strict=True)} for method in methods}
+    return {
+        method: {key: average[method] for key, average in zip(keys, averages, strict=True)}
+        for method in methods
+    }
 
 
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Figures of evaluations: the error against a setting, maps and observation maps of single captures, and relighting.
+"""Figures of evaluations: the error against a setting, maps and observation maps of single
+captures, and relighting.
 
-Curves show only the captures that all evaluations scored, so that every point of an average covers the same captures.
-Relighting compares photographs under lights that a draw leaves out with pictures of the material estimated from the
-others.
+Curves show only the captures that all evaluations scored, so that every point of an average covers
+the same captures. Relighting compares photographs under lights that a draw leaves out with pictures
+of the material estimated from the others.
 """
 
 from __future__ import annotations
@@ -36,23 +37,32 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-MOST_CAPTURES = 4  # with a panel each. With more, only the average is plotted, to keep the figure legible
+# with a panel each. With more, only the average is plotted, to keep the figure legible
+MOST_CAPTURES = 4
 _PANEL_INCHES = (3.2, 2.7)
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
-_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
+_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = (
+    (0, ()),
+    (0, (4, 2)),
+    (0, (1, 1.5)),
+    (0, (5, 1.5, 1, 1.5)),
+)
 
 
 def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
     """Return a PNG of the error against the number of lights K, on a logarithmic axis.
 
-    Each capture has a panel, and so does their average; with one capture, or more than MOST_CAPTURES, only the average
-    has a panel. "all" is plotted at the capture's number of lights, and in the panel of the average at the mean number.
-    If the light noise also varies, each of its values has its own dash pattern.
+    Each capture has a panel, and so does their average; with one capture, or more than
+    MOST_CAPTURES, only the average has a panel. "all" is plotted at the capture's number of lights,
+    and in the panel of the average at the mean number. If the light noise also varies, each of its
+    values has its own dash pattern.
     """
     return _curves(
         evaluations,
-        x=lambda e, capture: float(np.mean([r.n_lights for r in e.results if capture in (AVERAGE, r.capture)])),
+        x=lambda e, capture: float(
+            np.mean([r.n_lights for r in e.results if capture in (AVERAGE, r.capture)])
+        ),
         tick=lambda e, x: f"{x:.0f}\n(all)" if e.protocol.n_lights is None else f"{x:g}",
         series=lambda e: f"light noise {e.protocol.light_noise_deg:g} deg",
         label="number of lights",
@@ -84,25 +94,33 @@ def _curves(
     label: str,
     logarithmic: bool,
 ) -> bytes:
-    """Return the panels side by side as PNG, with one curve for each method and series, and one legend for all.
+    """Return the panels side by side as PNG, with one curve for each method and series, and one
+    legend for all.
 
-    Each curve has a band of one standard deviation on either side. Its colour and marker indicate the method, its
-    dashes the series. `x` returns an evaluation's position on a capture's x axis, `tick` the label there, and `series`
-    the name of its curves.
+    Each curve has a band of one standard deviation on either side. Its colour and marker indicate
+    the method, its dashes the series. `x` returns an evaluation's position on a capture's x axis,
+    `tick` the label there, and `series` the name of its curves.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     common = set.intersection(*(set(evaluation.captures) for evaluation in evaluations))
-    evaluations = [replace(e, results=tuple(r for r in e.results if r.capture in common)) for e in evaluations]
+    evaluations = [
+        replace(e, results=tuple(r for r in e.results if r.capture in common)) for e in evaluations
+    ]
     captures = evaluations[0].captures
     shown = [*captures, AVERAGE] if 1 < len(captures) <= MOST_CAPTURES else [AVERAGE]
     styles = method_styles(evaluations[0].methods)
-    dashes = {name: _DASHES[i % len(_DASHES)] for i, name in enumerate(dict.fromkeys(map(series, evaluations)))}
+    dashes = {
+        name: _DASHES[i % len(_DASHES)]
+        for i, name in enumerate(dict.fromkeys(map(series, evaluations)))
+    }
     across = 2 if len(shown) == 4 else min(len(shown), 3)
     down = math.ceil(len(shown) / across)
 
-    figure = Figure(figsize=(_PANEL_INCHES[0] * across, _PANEL_INCHES[1] * down + 0.4), layout="constrained")
+    figure = Figure(
+        figsize=(_PANEL_INCHES[0] * across, _PANEL_INCHES[1] * down + 0.4), layout="constrained"
+    )
     for capture, axes in zip_longest(shown, figure.subplots(down, across, squeeze=False).flat):
         if capture is None:
             axes.set_axis_off()
@@ -110,14 +128,20 @@ def _curves(
         in_order = sorted(evaluations, key=lambda e: x(e, capture))
         for method, style in styles.items():
             for name, pattern in dashes.items():
-                points = [(x(e, capture), *_error(e, method, capture)) for e in in_order if series(e) == name]
+                points = [
+                    (x(e, capture), *_error(e, method, capture))
+                    for e in in_order
+                    if series(e) == name
+                ]
                 place, mae_deg, std_deg = np.array(points).T
                 line = {"color": style.colour, "marker": style.marker, "linestyle": pattern}
                 axes.plot(place, mae_deg, markersize=4, linewidth=1.2, **line)
                 if std_deg.any():
                     low, high = mae_deg - std_deg, mae_deg + std_deg
                     axes.fill_between(place, low, high, color=style.colour, alpha=0.2, linewidth=0)
-        _set_ticks(axes, {x(e, capture): tick(e, x(e, capture)) for e in in_order}, logarithmic=logarithmic)
+        _set_ticks(
+            axes, {x(e, capture): tick(e, x(e, capture)) for e in in_order}, logarithmic=logarithmic
+        )
         average = captures[0] if len(captures) == 1 else f"average of {len(captures)} captures"
         title = average if capture == AVERAGE else capture
         axes.set_title(printable(title), fontsize=_LARGE, parse_math=False)
@@ -127,18 +151,30 @@ def _curves(
         axes.tick_params(labelsize=_SMALL)
         axes.grid(alpha=0.3)
     handles = [  # a dollar sign would begin a formula
-        Line2D([], [], color=style.colour, marker=style.marker, markersize=4, label=method.replace("$", r"\$"))
+        Line2D(
+            [],
+            [],
+            color=style.colour,
+            marker=style.marker,
+            markersize=4,
+            label=method.replace("$", r"\$"),
+        )
         for method, style in styles.items()
     ]
     if len(dashes) > 1:
-        handles += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()]
+        handles += [
+            Line2D([], [], color="0.3", linestyle=style, label=name)
+            for name, style in dashes.items()
+        ]
     columns = min(len(handles), 2 * across)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=_SMALL)
     return png_bytes(figure, 200)
 
 
 def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, float]:
-    """Return the mean error of a method on a capture or the average, and its standard deviation over the trials."""
+    """Return the mean error of a method on a capture or the average, and its standard deviation
+    over the trials.
+    """
     if capture == AVERAGE:
         return evaluation.averages[method], float(np.std(trial_averages(evaluation, method)))
     result = next(r for r in evaluation.results if (r.method, r.capture) == (method, capture))
@@ -146,7 +182,9 @@ def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, fl
 
 
 def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> None:
-    """Set ticks at the points, in ascending order. A label that would overlap the previous one is left out."""
+    """Set ticks at the points, in ascending order. A label that would overlap the previous one is
+    left out.
+    """
     from matplotlib.ticker import NullLocator
 
     if logarithmic:
@@ -155,7 +193,8 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     span = max(place.values()) - min(place.values())
     labels, last = [], -math.inf
     for x, position in place.items():
-        fits = position - last > 0.045 * span  # fraction of the axis; labels closer than this would overlap
+        # fraction of the axis; labels closer than this would overlap
+        fits = position - last > 0.045 * span
         labels.append(ticks[x] if fits else "")
         last = position if fits else last
     axes.set_xticks(list(place), labels)
@@ -183,12 +222,14 @@ def capture_figures(
     pixels: Sequence[tuple[int, int]],
     advance: Callable[[float], object],
 ) -> list[CaptureFigure]:
-    """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one of single pixels.
+    """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one
+    of single pixels.
 
-    The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near lamps or with a
-    camera matrix. All pixels in the mask are estimated, even if the protocol has max_pixels. `name` is the capture's in
-    the tables, and `stem` is the stem of the files. `advance` is called with the fraction of the work just completed.
-    Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
+    The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near
+    lamps or with a camera matrix. All pixels in the mask are estimated, even if the protocol has
+    max_pixels. `name` is the capture's in the tables, and `stem` is the stem of the files.
+    `advance` is called with the fraction of the work just completed. Raises InputError if the
+    capture cannot be read or scored, or UsageError if a pixel has no ground truth.
     """
     steps = 1 + len(estimators)
     stored, capture = read_first_draw(folder, name, protocol, lambda share: advance(share / steps))
@@ -200,17 +241,30 @@ def capture_figures(
             capture, estimator, progress=lambda count: advance(count / capture.n_pixels / steps)
         )
         assert estimate.error_map_deg is not None
-        normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
+        normals[estimator.name], errors_deg[estimator.name] = (
+            estimate.normal_map,
+            estimate.error_map_deg,
+        )
     # The largest number of lights listed in a title.
     listed = f" ({', '.join(map(str, capture.light_indices))})" if capture.n_lights <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
-    figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
-    network = next((e for e in estimators if e.name in METHODS and METHODS[e.name].observation_maps), None)
+    figures = [
+        CaptureFigure(
+            stem, f"{title}. Normal maps above error maps, ground truth at the left.", png
+        )
+    ]
+    network = next(
+        (e for e in estimators if e.name in METHODS and METHODS[e.name].observation_maps), None
+    )
     # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
-        whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
-        png = _observation_maps(whole, capture, network, errors_deg[network.name], pixels, title=title)
+        whole = (
+            stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
+        )
+        png = _observation_maps(
+            whole, capture, network, errors_deg[network.name], pixels, title=title
+        )
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
         figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
@@ -221,7 +275,9 @@ def file_stems(names: Sequence[str]) -> list[str]:
     stems: list[str] = []
     taken: set[str] = set()
     for name in names:
-        stem = free_name(name.replace("/", "_"), lambda stem: not taken.isdisjoint((stem, f"{stem}{MAPS}")), "_")
+        stem = free_name(
+            name.replace("/", "_"), lambda stem: not taken.isdisjoint((stem, f"{stem}{MAPS}")), "_"
+        )
         taken.update((stem, f"{stem}{MAPS}"))
         stems.append(stem)
     return stems
@@ -236,21 +292,30 @@ def _observation_maps(
     *,
     title: str,
 ) -> bytes:
-    """Return the figure for the given pixels. Raises UsageError for a pixel without ground truth."""
+    """Return the figure for the given pixels. Raises UsageError for a pixel without ground
+    truth.
+    """
     for row, column in pixels:
         inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
         if not inside or np.isnan(errors_deg[row, column]):
-            problem = f"the pixel in row {row}, column {column} of {capture.name} has no ground truth"
+            problem = (
+                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth"
+            )
             hint = "Name pixels on the object, rows from the top and columns from the left, from 0"
             raise UsageError(problem, hint=hint)
     rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
     if not pixels:
         order = np.argsort(errors_deg[rows, columns], kind="stable")
-        chosen = [order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES]
+        chosen = [
+            order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES
+        ]
         rows, columns = rows[chosen], columns[chosen]
     place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
     maps = estimator.observation_maps(
-        capture.observations[place], capture.light_directions, whole.observations[place], whole.light_directions
+        capture.observations[place],
+        capture.light_directions,
+        whole.observations[place],
+        whole.light_directions,
     )
     assert maps is not None
     return observation_map_figure(
@@ -265,21 +330,31 @@ def _observation_maps(
 
 
 def relight_first_draw(
-    folder: Path, name: str, estimator: Estimator, protocol: Protocol, advance: Callable[[float], object]
+    folder: Path,
+    name: str,
+    estimator: Estimator,
+    protocol: Protocol,
+    advance: Callable[[float], object],
 ) -> RelightingReport:
-    """Return how well the material from the protocol's first draw predicts the photographs under the other lights.
+    """Return how well the material from the protocol's first draw predicts the photographs under
+    the other lights.
 
-    `name` is the capture's in the tables, and `advance` is called with the fraction of the images just read. Raises
-    UsageError if no light is left, or the lamps or the camera are near; InputError if the capture cannot be read, or
-    too few lights are used.
+    `name` is the capture's in the tables, and `advance` is called with the fraction of the images
+    just read. Raises UsageError if no light is left, or the lamps or the camera are near;
+    InputError if the capture cannot be read, or too few lights are used.
     """
     from splinecli.materials.maps import lights_that_reach, render_gray
 
     stored, given = read_first_draw(folder, name, protocol, advance)
     whole = stored.capture
-    held = [place for place, light in enumerate(whole.light_indices) if light not in given.light_indices]
+    held = [
+        place for place, light in enumerate(whole.light_indices) if light not in given.light_indices
+    ]
     if not held:
-        raise UsageError(f"{name}: the draw uses all lights, so none is held out", hint="Use a smaller --n-lights")
+        raise UsageError(
+            f"{name}: the draw uses all lights, so none is held out",
+            hint="Use a smaller --n-lights",
+        )
     if whole.lamps is not None or whole.camera_matrix is not None:
         raise UsageError(f"{name}: --relight needs distant lights and an orthographic camera")
     estimate = estimate_normals(given, estimator)
@@ -313,8 +388,12 @@ def likeness(photographs: Float32Array, pictures: Float32Array) -> Likeness:
 
 
 def lambertian(given: Capture, normals: Float32Array, lights: Floats) -> Float32Array:
-    """Return pictures (P, F) of a matte surface under lights (F, 3), with the albedo that `infer` computes."""
+    """Return pictures (P, F) of a matte surface under lights (F, 3), with the albedo that `infer`
+    computes.
+    """
     cosines = (normals @ given.light_directions.T).astype(np.float32)
     weights = agreeing_lights(given.observations, cosines) * cosines
-    albedo = (weights * given.observations).sum(axis=1) / np.maximum((weights * cosines).sum(axis=1), 1e-6)
+    albedo = (weights * given.observations).sum(axis=1) / np.maximum(
+        (weights * cosines).sum(axis=1), 1e-6
+    )
     return np.asarray(albedo[:, None] * (normals @ lights.T).clip(0), np.float32)

@@ -1,4 +1,6 @@
-"""The protocol of an evaluation (draws of lights, trials, noise, pixels, how captures are read) and its outcome."""
+"""The protocol of an evaluation (draws of lights, trials, noise, pixels, how captures are read) and
+its outcome.
+"""
 
 import math
 import re
@@ -17,7 +19,8 @@ from splinecli.maths import Float64Array
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.records.documents import SkippedCapture
 
-# Of the seeds: noise and choice of pixels are independent of each other and of the draws (DRAWS_STREAM).
+# Of the seeds: noise and choice of pixels are independent of each other and of the draws
+# (DRAWS_STREAM).
 NOISE_STREAM, PIXELS_STREAM = 2, 3
 
 
@@ -34,7 +37,8 @@ class DrawsFile:
         return len(self.draws[0])
 
     def check_against(self, light_directions: Float64Array, *, skipped: int = 0) -> None:
-        """Raise InputError, with the line number, for a draw that does not fit a capture under these lights (F, 3).
+        """Raise InputError, with the line number, for a draw that does not fit a capture under
+        these lights (F, 3).
 
         Draws must not include the first `skipped` lights.
         """
@@ -44,7 +48,9 @@ class DrawsFile:
                 problem = f"found light index {max(draw)}, expected 0 to {available - 1}"
                 problem += f": the capture has {available} lights"
             elif min(draw) < skipped:
-                problem = f"found light index {min(draw)}; the first {skipped} images are to be skipped"
+                problem = (
+                    f"found light index {min(draw)}; the first {skipped} images are to be skipped"
+                )
             elif in_one_plane(light_directions[list(draw)]):
                 problem = "the lights of this draw are in one plane, so no normal can be found"
             else:
@@ -53,11 +59,12 @@ class DrawsFile:
 
 
 def read_draws(path: Path) -> DrawsFile:
-    """Return the draws in a text file. Each line is one draw: zero-based light indices separated by spaces or commas.
+    """Return the draws in a text file. Each line is one draw: zero-based light indices separated by
+    spaces or commas.
 
-    "#" comments and blank lines are skipped. Raises InputError, with the line number, for a word that is not a light
-    index, a repeated index, fewer than three lights, or a number of lights that differs from the first draw; also for a
-    file without draws.
+    "#" comments and blank lines are skipped. Raises InputError, with the line number, for a word
+    that is not a light index, a repeated index, fewer than three lights, or a number of lights that
+    differs from the first draw; also for a file without draws.
     """
     draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
@@ -66,20 +73,31 @@ def read_draws(path: Path) -> DrawsFile:
             draws.append(_read_draw(words, len(draws[0]) if draws else len(words), path, line))
             lines.append(line)
     if not draws:
-        raise InputError("the file contains no draws, expected a line of light indices for each", path=path)
+        raise InputError(
+            "the file contains no draws, expected a line of light indices for each", path=path
+        )
     return DrawsFile(path, tuple(draws), tuple(lines))
 
 
 def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     for word in words:
         if re.fullmatch("[0-9]{1,9}", word) is None:
-            raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
+            raise InputError(
+                f'found "{word[:40]}", expected a light index from 0', path=path, line=line
+            )
     draw = tuple(map(int, words))
     for position, index in enumerate(draw):
         if index in draw[:position]:
-            raise InputError(f"light index {index} is listed twice", path=path, line=line, hint="Name each light once")
+            raise InputError(
+                f"light index {index} is listed twice",
+                path=path,
+                line=line,
+                hint="Name each light once",
+            )
     if len(draw) < MIN_LIGHTS:
-        raise InputError(f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line)
+        raise InputError(
+            f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line
+        )
     if len(draw) != n_lights:
         problem = f"found {len(draw)} light indices, expected {n_lights} as in the first draw"
         raise InputError(problem, path=path, line=line)
@@ -96,17 +114,25 @@ class Protocol:
     Raises UsageError if a value is out of its range.
     """
 
-    n_lights: int | None = None  # in each draw; None for all. A draws file overrides this field and trials
-    trials: int = 1  # the number of random draws. Without light noise, a draw of all lights needs only one trial.
+    # in each draw; None for all. A draws file overrides this field and trials
+    n_lights: int | None = None
+    # the number of random draws. Without light noise, a draw of all lights needs only one trial.
+    trials: int = 1
     seed: int = 0  # for the draws, the light noise and the choice of pixels
     draws_file: Path | None = None  # file that provides the draws instead; see read_draws
-    light_noise_deg: float = 0.0  # standard deviation of the angle by which each trial tilts the light directions
-    max_pixels: int | None = None  # to score in each capture, chosen at random; None for all with ground truth
-    skip_first: Mapping[str, int] = field(default_factory=dict)  # images, by the name of the capture or EVERY_CAPTURE
-    as_stored: bool = False  # whether the stored values are scored, as in published tables, or read as in `infer`
+    # standard deviation of the angle by which each trial tilts the light directions
+    light_noise_deg: float = 0.0
+    # to score in each capture, chosen at random; None for all with ground truth
+    max_pixels: int | None = None
+    # images, by the name of the capture or EVERY_CAPTURE
+    skip_first: Mapping[str, int] = field(default_factory=dict)
+    # whether the stored values are scored, as in published tables, or read as in `infer`
+    as_stored: bool = False
     white_level: float | None = None
-    light_error_deg: float | None = None  # typical error with which trials refine the lights (see refine_capture)
-    finds_lights: bool = False  # whether trials estimate their lights from the images, as `infer --lights estimate`
+    # typical error with which trials refine the lights (see refine_capture)
+    light_error_deg: float | None = None
+    # whether trials estimate their lights from the images, as `infer --lights estimate`
+    finds_lights: bool = False
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -123,8 +149,12 @@ def lights_value(protocol: Protocol) -> int | Literal["all"]:
 
 
 def heading(protocol: Protocol) -> str:
-    """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
-    noise = f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
+    """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of
+    2 degrees".
+    """
+    noise = (
+        f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
+    )
     return f"{lights_value(protocol)} lights{noise}"
 
 
@@ -135,7 +165,9 @@ def protocol_in_words(protocol: Protocol) -> str:
         parts.append(f"the {protocol.trials} draws of {protocol.draws_file.name}")
     elif protocol.n_lights is not None:
         parts.append(f"{protocol.trials} random {'draw' if protocol.trials == 1 else 'draws'}")
-    elif protocol.light_noise_deg:  # without noise, all lights need one trial, regardless of the number given
+    elif (
+        protocol.light_noise_deg
+    ):  # without noise, all lights need one trial, regardless of the number given
         parts.append(f"{protocol.trials} {'trial' if protocol.trials == 1 else 'trials'}")
     parts.append(f"seed {protocol.seed}")
     if protocol.max_pixels is not None:
@@ -157,9 +189,11 @@ class Result:
     method: str
     capture: str  # name of the capture in the tables
     n_lights: int  # number of lights in each draw
-    maes_deg: tuple[float, ...]  # mean angular error (MAE) over the scored pixels, in degrees, of each trial
+    # mean angular error (MAE) over the scored pixels, in degrees, of each trial
+    maes_deg: tuple[float, ...]
     seconds: float  # mean time to estimate the normals in a trial
-    found_light_error_deg: float | None = None  # mean error of light directions that the trials estimated
+    # mean error of light directions that the trials estimated
+    found_light_error_deg: float | None = None
 
     @property
     def trials(self) -> int:
@@ -181,7 +215,8 @@ class Evaluation:
     """The outcome of one protocol."""
 
     protocol: Protocol  # the protocol; n_lights and trials are taken from the draws file, if given
-    results: tuple[Result, ...]  # one per capture and method, ordered by capture as given, then by method
+    # one per capture and method, ordered by capture as given, then by method
+    results: tuple[Result, ...]
     skipped: tuple[SkippedCapture, ...] = ()  # the captures that could not be scored
     notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
     # "weights", "device", "precision" and "fingerprint" of each method by name; see Estimator
@@ -197,13 +232,18 @@ class Evaluation:
 
     @property
     def averages(self) -> dict[str, float]:
-        """Mean of mae_deg over the captures, by method. Every method has a result for every capture."""
+        """Mean of mae_deg over the captures, by method. Every method has a result for every
+        capture.
+        """
         return {
-            method: math.fsum(r.mae_deg for r in self.results if r.method == method) / len(self.captures)
+            method: math.fsum(r.mae_deg for r in self.results if r.method == method)
+            / len(self.captures)
             for method in self.methods
         }
 
 
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[SkippedCapture]:
     """Return the captures skipped by any of the evaluations; repeated reasons are listed once."""
-    return list({(each.capture, each.reason): each for e in evaluations for each in e.skipped}.values())
+    return list(
+        {(each.capture, each.reason): each for e in evaluations for each in e.skipped}.values()
+    )

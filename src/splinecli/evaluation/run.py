@@ -19,7 +19,14 @@ from splinecli.capture.files import digest
 from splinecli.capture.record import StoredCapture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator
-from splinecli.evaluation.protocol import EVERY_CAPTURE, DrawsFile, Evaluation, Protocol, Result, read_draws
+from splinecli.evaluation.protocol import (
+    EVERY_CAPTURE,
+    DrawsFile,
+    Evaluation,
+    Protocol,
+    Result,
+    read_draws,
+)
 from splinecli.evaluation.tables import AVERAGE
 from splinecli.evaluation.trials import (
     CaptureReading,
@@ -55,7 +62,9 @@ class ProtocolTrials:
     def evaluation(
         self, captures: Sequence[str], store: TrialStore, settings: Mapping[str, Mapping[str, Any]]
     ) -> Evaluation:
-        """Return the outcome, in the order of the captures. Raises an error if all captures failed."""
+        """Return the outcome, in the order of the captures. Raises an error if all captures
+        failed.
+        """
         results, n_estimated, light_errors_deg = [], {}, {}
         for (capture, method), trials in self.trials.items():
             scores = [score for trial in trials if (score := store.find(trial)) is not None]
@@ -63,27 +72,40 @@ class ProtocolTrials:
             maes_deg = tuple(score.mae_deg for score in scores)
             found = [s.found_light_error_deg for s in scores if s.found_light_error_deg is not None]
             light_errors_deg[capture] = math.fsum(found) / len(found) if found else None
-            result = Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_errors_deg[capture])
+            result = Result(
+                method, capture, len(trials[0].lights), maes_deg, seconds, light_errors_deg[capture]
+            )
             results.append(result)
-            n_estimated[capture] = (sum(score.estimated_intensities for score in scores), len(scores))
+            n_estimated[capture] = (
+                sum(score.estimated_intensities for score in scores),
+                len(scores),
+            )
         if not results:
             failures = [self.failures[name] for name in captures]
             if len(failures) == 1:
                 raise failures[0]
-            kind = UsageError if all(isinstance(failure, UsageError) for failure in failures) else InputError
+            kind = (
+                UsageError
+                if all(isinstance(failure, UsageError) for failure in failures)
+                else InputError
+            )
             first = str(failures[0]).removesuffix(".")
             raise kind(f"none of the {len(failures)} captures could be scored; the first: {first}")
         skipped = (
-            SkippedCapture(capture=name, reason=str(self.failures[name])) for name in captures if name in self.failures
+            SkippedCapture(capture=name, reason=str(self.failures[name]))
+            for name in captures
+            if name in self.failures
         )
         notes = [note for name in captures for note in self.notes.get(name, ())]
         notes += [
-            f"{name}: no file gives the light intensities; they were estimated in {count} of {of} trials."
+            f"{name}: no file gives the light intensities; they were estimated in {count} of {of}"
+            " trials."
             for name, (count, of) in n_estimated.items()
             if count
         ]
         notes += [
-            f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on average."
+            f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on"
+            " average."
             for name, error_deg in light_errors_deg.items()
             if error_deg is not None
         ]
@@ -92,7 +114,9 @@ class ProtocolTrials:
 
 @dataclass
 class CaptureJob:
-    """An open capture with the protocols that can score it and, for each draw, the missing trials."""
+    """An open capture with the protocols that can score it and, for each draw,
+    the missing trials.
+    """
 
     source: CaptureSource
     reading: CaptureReading
@@ -109,11 +133,17 @@ class CaptureJob:
 
 
 def plan_capture(
-    folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[ProtocolTrials], store: TrialStore
+    folder: Path,
+    name: str,
+    estimators: Sequence[Estimator],
+    tasks: Sequence[ProtocolTrials],
+    store: TrialStore,
 ) -> CaptureJob | None:
-    """Add the trials of a capture to the tasks, and return the trials that are not in the store as a job.
+    """Add the trials of a capture to the tasks, and return the trials that are not in the store as
+    a job.
 
-    If no protocol can score the capture, the result is None, and the reasons are recorded in the tasks.
+    If no protocol can score the capture, the result is None, and the reasons are recorded in the
+    tasks.
     """
     try:
         source = open_to_score(folder, tasks[0].protocol)
@@ -121,9 +151,12 @@ def plan_capture(
         for task in tasks:
             task.fail(name, error)
         return None
-    made_of = [digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators]
+    made_of = [
+        digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators
+    ]
     able: list[ProtocolTrials] = []
-    # Group all methods of a draw, because they share its capture, and because the remaining time can then be estimated.
+    # Group all methods of a draw, because they share its capture, and because the remaining time
+    # can then be estimated.
     draws: list[list[Trial]] = []
     for task in tasks:
         try:
@@ -140,26 +173,40 @@ def plan_capture(
                 draws[-1].append(trial)
     if not able:
         return None
-    missing = [left for draw in draws if (left := [trial for trial in draw if store.find(trial) is None])]
+    missing = [
+        left for draw in draws if (left := [trial for trial in draw if store.find(trial) is None])
+    ]
     needed = missing or draws[:1]  # the notes on the capture require its mask and its ground truth
     protocols = tuple(task.protocol for task in able)
     methods = {trial.method for draw in needed for trial in draw}
-    whole = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
-    whole = whole or any(estimator.needs_capture for estimator in estimators if estimator.name in methods)
+    whole = any(
+        protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols
+    )
+    whole = whole or any(
+        estimator.needs_capture for estimator in estimators if estimator.name in methods
+    )
     seen = sorted({light for draw in needed for light in draw[0].lights})
-    return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
+    return CaptureJob(
+        source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing
+    )
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol, with n_lights and trials taken from its draws file, and the draws. Raises InputError."""
+    """Return the protocol, with n_lights and trials taken from its draws file, and the draws.
+    Raises InputError.
+    """
     if protocol.draws_file is None:
         return protocol, None
     draws_file = read_draws(protocol.draws_file)
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 
-def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
-    """Return the draws of a capture, one for each trial. Raises InputError or UsageError if it does not fit."""
+def draws_for(
+    source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None
+) -> list[Draw]:
+    """Return the draws of a capture, one for each trial. Raises InputError or UsageError if it does
+    not fit.
+    """
     if source.files.ground_truth is None:  # known before the images are read
         hint = "Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat"
         raise InputError("the capture has no ground truth", path=source.files.folder, hint=hint)
@@ -172,7 +219,9 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
     left = source.n_lights - skipped
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)
     if skipped and left < fewest:
-        found = f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}"
+        found = (
+            f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}"
+        )
         raise UsageError(f"{found}, expected at least {fewest}")
     if draws_file is not None:
         draws_file.check_against(source.light_directions, skipped=skipped)
@@ -185,25 +234,31 @@ def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: 
 
 
 def read_first_draw(
-    folder: Path, name: str, protocol: Protocol, progress: Callable[[float], object] = lambda share: None
+    folder: Path,
+    name: str,
+    protocol: Protocol,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[StoredCapture, Capture]:
     """Return a capture under all lights that are not skipped, and under the protocol's first draw.
 
-    `progress` is called with the fraction of the images just read. Raises InputError or UsageError if the capture
-    cannot be read or scored.
+    `progress` is called with the fraction of the images just read. Raises InputError or UsageError
+    if the capture cannot be read or scored.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     protocol, draws_file = read_draws_file(protocol)
     trial = Trial(name, "", 0, draws_for(source, name, protocol, draws_file)[0], protocol, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
-    stored = source.read_stored(lights, lambda: progress(1 / len(lights)), as_stored=protocol.as_stored)
+    stored = source.read_stored(
+        lights, lambda: progress(1 / len(lights)), as_stored=protocol.as_stored
+    )
     return stored, TrialSource(stored).see(trial)
 
 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     """Return the folders, without duplicates, with the names of the captures.
 
-    If two names are equal, or one is the name of the average in the tables, all are the last parts of their paths.
+    If two names are equal, or one is the name of the average in the tables, all are the last parts
+    of their paths.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
@@ -218,13 +273,16 @@ def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
 
 
 class DrawTask(NamedTuple):
-    """One draw of a capture: its trials, and the data read for all draws. Without trials, only notes are returned."""
+    """One draw of a capture: its trials, and the data read for all draws. Without trials, only
+    notes are returned.
+    """
 
     reading: CaptureReading
     trials: Sequence[Trial]
 
 
-# The score of each trial of a draw and the notes on its capture, or the reason that the capture cannot be scored
+# The score of each trial of a draw and the notes on its capture, or the reason that the capture
+# cannot be scored
 Scored = tuple[Sequence[Score], Notes] | SplinecliError
 # Scores draws in other processes, and yields each draw with its scores as it finishes
 Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
@@ -242,10 +300,11 @@ def evaluate_all(
     elsewhere: Elsewhere | None = None,
     on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
-    """Score every estimator on every capture under every protocol. None may be empty, and names must be unique.
+    """Score every estimator on every capture under every protocol. None may be empty, and names
+    must be unique.
 
-    A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the outcome contains the
-    reason. See distinct_names for the names of captures.
+    A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the
+    outcome contains the reason. See distinct_names for the names of captures.
 
     Args:
         store: where finished trials are stored; trials in the store are not computed again.
@@ -255,7 +314,8 @@ def evaluate_all(
 
     Raises:
         UsageError: skip_first names a capture that does not exist.
-        InputError: the draws file is invalid, or no capture could be scored; a single capture's own error is raised.
+        InputError: the draws file is invalid, or no capture could be scored; a single capture's own
+            error is raised.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
@@ -264,15 +324,29 @@ def evaluate_all(
     names = list(names_by_folder.values())
     for protocol in protocols:
         for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
-            raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
+            raise UsageError(
+                f"no capture named {name!r} to skip images of; there are {', '.join(names)}"
+            )
     store = TrialStore() if store is None else store
-    planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]
+    planned = [
+        plan_capture(folder, name, estimators, tasks, store)
+        for folder, name in names_by_folder.items()
+    ]
     captures_to_score = [job for job in planned if job is not None]
-    progress = _Progress(sum(len(draw) for job in captures_to_score for draw in job.draws), on_progress)
+    progress = _Progress(
+        sum(len(draw) for job in captures_to_score for draw in job.draws), on_progress
+    )
     if elsewhere is None:
         with _share_cores(jobs), ThreadPoolExecutor(jobs) as workers:
             try:
-                _score_here(captures_to_score, {e.name: e for e in estimators}, store, progress, workers, jobs)
+                _score_here(
+                    captures_to_score,
+                    {e.name: e for e in estimators},
+                    store,
+                    progress,
+                    workers,
+                    jobs,
+                )
             except BaseException:
                 workers.shutdown(cancel_futures=True)
                 raise
@@ -321,7 +395,9 @@ def _score_elsewhere(
 ) -> None:
     """Score the trials in other processes. Errors from trials are passed on."""
     jobs = {job.reading.name: job for job in captures}
-    for task, scored in elsewhere([DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]):
+    for task, scored in elsewhere(
+        [DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]
+    ):
         job = jobs[task.reading.name]
         if isinstance(scored, SplinecliError):
             job.fail(scored)
@@ -364,7 +440,9 @@ class _Progress:
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
-    """Wait until at most this many trials are running, and return them. Errors from finished trials are passed on."""
+    """Wait until at most this many trials are running, and return them. Errors from finished trials
+    are passed on.
+    """
     while len(running) > at_most:
         finished, running = wait(running, return_when=FIRST_COMPLETED)
         for future in finished:
@@ -374,7 +452,9 @@ def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
 
 @contextmanager
 def _share_cores(jobs: int) -> Iterator[None]:
-    """Limit PyTorch to a share of the cores for each of `jobs` parallel trials. This does not import PyTorch."""
+    """Limit PyTorch to a share of the cores for each of `jobs` parallel trials. This does not
+    import PyTorch.
+    """
     torch = sys.modules.get("torch")
     if torch is None or jobs == 1:
         yield

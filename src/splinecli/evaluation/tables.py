@@ -1,12 +1,13 @@
 """Tests of whether methods differ by more than the draws of lights explain, and tables for people.
 
-All methods are given the same draws, and a draw that is hard for one method is usually hard for the others. The test
-therefore uses the differences trial by trial: a paired t-test (Student, Biometrika 1908), corrected for the number of
-pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers only the variation
-between draws. A significant difference generalises to other lights on this capture, not to other captures.
+All methods are given the same draws, and a draw that is hard for one method is usually hard for the
+others. The test therefore uses the differences trial by trial: a paired t-test (Student, Biometrika
+1908), corrected for the number of pairs of methods on one capture (Holm, Scandinavian Journal of
+Statistics 1979). The test covers only the variation between draws. A significant difference
+generalises to other lights on this capture, not to other captures.
 
-The tables are Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or several with the same
-methods that differ in n_lights, light_noise_deg or both.
+The tables are Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or
+several with the same methods that differ in n_lights, light_noise_deg or both.
 """
 
 import re
@@ -27,24 +28,31 @@ _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are conside
 
 
 def compare(evaluation: Evaluation) -> list[ComparisonReport]:
-    """Return the comparison of every pair of methods on every capture, then on the average over the captures.
+    """Return the comparison of every pair of methods on every capture, then on the average over the
+    captures.
 
     Trial t of the average is the mean of trial t over the captures. See trial_averages.
     """
     errors = {
-        name: {r.method: r.maes_deg for r in evaluation.results if r.capture == name} for name in evaluation.captures
+        name: {r.method: r.maes_deg for r in evaluation.results if r.capture == name}
+        for name in evaluation.captures
     }
     errors[AVERAGE] = {method: trial_averages(evaluation, method) for method in evaluation.methods}
     protocol = evaluation.protocol
     settings = {"n_lights": lights_value(protocol), "light_noise_deg": protocol.light_noise_deg}
-    return [each for capture, of in errors.items() for each in _compare_all(of, capture=capture, **settings)]
+    return [
+        each
+        for capture, of in errors.items()
+        for each in _compare_all(of, capture=capture, **settings)
+    ]
 
 
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     """Return the MAE of a method in degrees for each trial, averaged over the captures.
 
-    If a capture has only one trial, for example because it has just K lights, that trial is repeated. If the numbers of
-    trials differ otherwise, only the trials common to all captures are averaged.
+    If a capture has only one trial, for example because it has just K lights, that trial is
+    repeated. If the numbers of trials differ otherwise, only the trials common to all captures are
+    averaged.
     """
     maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
     most = max(map(len, maes_deg))
@@ -63,7 +71,10 @@ def in_words(c: ComparisonReport) -> str:
     low, high = c.interval_deg
     if c.differs:
         low, high = sorted((abs(low), abs(high)))
-        return f"{better} is better than {worse} by {size} (95 % interval {low:.2f} to {high:.2f}, {test})."
+        return (
+            f"{better} is better than {worse} by {size} (95 % interval {low:.2f} to {high:.2f},"
+            f" {test})."
+        )
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
     details = f"{c.difference_deg:+.2f} degrees, {interval}, {test}"
     return f"{c.first} and {c.second} do not differ significantly ({details})."
@@ -71,7 +82,13 @@ def in_words(c: ComparisonReport) -> str:
 
 def p_in_words(p_value: float) -> str:
     """Return a p-value as text: "p < 0.001", "p = 0.032"."""
-    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}" if p_value < 0.1 else f"p = {p_value:.2f}"
+    return (
+        "p < 0.001"
+        if p_value < 0.001
+        else f"p = {p_value:.3f}"
+        if p_value < 0.1
+        else f"p = {p_value:.2f}"
+    )
 
 
 def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> list[ComparisonReport]:
@@ -98,7 +115,9 @@ def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> lis
     return compared
 
 
-def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] | None, float | None]:
+def _paired_test(
+    differences: NDArray[np.float64],
+) -> tuple[tuple[float, float] | None, float | None]:
     """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
     if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
         return (0.0, 0.0), 1.0
@@ -114,7 +133,8 @@ def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's step-down correction.
 
-    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values do not decrease and are at most 1.
+    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values do not decrease and
+    are at most 1.
     """
     order = np.argsort(p_values, kind="stable")
     stepped = np.array(p_values)[order] * np.arange(len(p_values), 0, -1)
@@ -123,7 +143,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in corrected]
 
 
-_MOST_WIDE = 6  # captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
+# captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
+_MOST_WIDE = 6
 _LATEX = str.maketrans(
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -133,7 +154,9 @@ _LATEX = str.maketrans(
 
 
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return a header row, then a row for each method: name, MAE on each capture, average; with two decimals."""
+    """Return a header row, then a row for each method: name, MAE on each capture, average; with two
+    decimals.
+    """
     mae_deg = {(result.method, result.capture): result.mae_deg for result in evaluation.results}
     rows = [["method", *(printable(name) for name in evaluation.captures), AVERAGE]]
     for method, average in evaluation.averages.items():
@@ -143,24 +166,31 @@ def table_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
-    """Return the (row, column) of the smallest printed values in each column; empty for a single method."""
+    """Return the (row, column) of the smallest printed values in each column; empty for a single
+    method.
+    """
     best = set()
     if len(rows) > 2:
         for column in range(1, len(rows[0])):
             smallest = min(float(row[column]) for row in rows[1:])
-            best |= {(i, column) for i, row in enumerate(rows) if i and float(row[column]) == smallest}
+            best |= {
+                (i, column) for i, row in enumerate(rows) if i and float(row[column]) == smallest
+            }
     return best
 
 
 def caption(evaluation: Evaluation) -> str:
-    """Return a table's caption, with the protocol: "Mean angular error in degrees: 10 lights, ..."."""
+    """Return a table's caption, with the protocol: "Mean angular error in degrees: 10 lights,
+    ...".
+    """
     return f"Mean angular error in degrees: {protocol_in_words(evaluation.protocol)}."
 
 
 def markdown(evaluations: Sequence[Evaluation]) -> str:
     """Return a Markdown table of methods by captures and their average, with a caption below it.
 
-    The best value in each column is bold. With several evaluations, each has its own table under a heading.
+    The best value in each column is bold. With several evaluations, each has its own table under a
+    heading.
     """
     tables = []
     for evaluation in evaluations:
@@ -186,9 +216,16 @@ def _escape_markdown(text: str) -> str:
 
 
 def _latex_table(evaluation: Evaluation) -> str:
-    head, *rows = (" & ".join(row) + r" \\" for row in _marked_rows(evaluation, _escape_latex, r"\textbf{{{}}}"))
+    head, *rows = (
+        " & ".join(row) + r" \\"
+        for row in _marked_rows(evaluation, _escape_latex, r"\textbf{{{}}}")
+    )
     best = " The best of each column in bold." if len(rows) > 1 else ""
-    narrow = [r"  \footnotesize\setlength{\tabcolsep}{2pt}"] if len(evaluation.captures) > _MOST_WIDE else []
+    narrow = (
+        [r"  \footnotesize\setlength{\tabcolsep}{2pt}"]
+        if len(evaluation.captures) > _MOST_WIDE
+        else []
+    )
     lines = [
         r"\begin{table*}",
         r"  \centering",
@@ -206,12 +243,17 @@ def _latex_table(evaluation: Evaluation) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _marked_rows(evaluation: Evaluation, escape: Callable[[str], str], bold: str) -> list[list[str]]:
+def _marked_rows(
+    evaluation: Evaluation, escape: Callable[[str], str], bold: str
+) -> list[list[str]]:
     """Return table_rows with the best cells formatted by a template for bold text."""
     rows = table_rows(evaluation)
     best = best_cells(rows)
     return [
-        [bold.format(escape(cell)) if (r, c) in best else escape(cell) for c, cell in enumerate(row)]
+        [
+            bold.format(escape(cell)) if (r, c) in best else escape(cell)
+            for c, cell in enumerate(row)
+        ]
         for r, row in enumerate(rows)
     ]
 

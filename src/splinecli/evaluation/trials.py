@@ -1,4 +1,6 @@
-"""Trials, the store of their scores, which are saved as they are computed, and the capture data for each trial."""
+"""Trials, the store of their scores, which are saved as they are computed, and the capture data for
+each trial.
+"""
 
 import hashlib
 import json
@@ -37,7 +39,9 @@ from splinecli.system.publishing import is_plain
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one capture under one draw of lights, with everything that affects its score."""
+    """One method on one capture under one draw of lights, with everything that affects its
+    score.
+    """
 
     capture: str  # name of the capture in the tables
     method: str
@@ -49,13 +53,26 @@ class Trial:
     @property
     def record(self) -> dict[str, Any]:
         """The trial as JSON values."""
-        names = ("capture", "method", "number", "lights", "light_noise_deg", "seed", "max_pixels", "as_stored")
+        names = (
+            "capture",
+            "method",
+            "number",
+            "lights",
+            "light_noise_deg",
+            "seed",
+            "max_pixels",
+            "as_stored",
+        )
         values = vars(self) | vars(self.protocol)
-        return {name: values[name] for name in (*names, "made_of", "light_error_deg", "finds_lights")}
+        return {
+            name: values[name] for name in (*names, "made_of", "light_error_deg", "finds_lights")
+        }
 
     @property
     def key(self) -> str:
-        """SHA-256 of all that affects the score. The noise depends on seed and number, the pixels on the seed."""
+        """SHA-256 of all that affects the score. The noise depends on seed and number, the pixels
+        on the seed.
+        """
         values = self.record
         del values["capture"]  # only a name in the tables; made_of covers the files themselves
         if self.protocol.light_error_deg is None:
@@ -75,7 +92,8 @@ class Score(Struct, frozen=True):
     mae_deg: float  # mean angular error over the scored pixels
     seconds: float  # time spent on estimating their normals
     estimated_intensities: bool  # whether the light intensities were estimated from the images
-    found_light_error_deg: float | None = None  # mean error of light directions that were estimated from the images
+    # mean error of light directions that were estimated from the images
+    found_light_error_deg: float | None = None
 
 
 class _Line(Score, frozen=True, kw_only=True):
@@ -85,10 +103,12 @@ class _Line(Score, frozen=True, kw_only=True):
 
 
 class TrialStore:
-    """Scores by trial, in memory and, if a path is given, in a JSON Lines file, which is created for the first score.
+    """Scores by trial, in memory and, if a path is given, in a JSON Lines file, which is created
+    for the first score.
 
-    Lines that cannot be read, for example because they were truncated, are dropped. A link is replaced, not followed.
-    `fresh` deletes the scores of an earlier evaluation. Raises OutputError if the file cannot be read or written.
+    Lines that cannot be read, for example because they were truncated, are dropped. A link is
+    replaced, not followed. `fresh` deletes the scores of an earlier evaluation. Raises OutputError
+    if the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:
@@ -121,31 +141,38 @@ class TrialStore:
             if self._path is None:
                 return
             line = json.dumps({**trial.record, **structs.asdict(score), "key": trial.key})
-            with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
+            with (
+                refusals_as_output_errors(self._path),
+                self._path.open("a", encoding="utf-8") as file,
+            ):
                 file.write(line + "\n")
 
 
-OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
+# called with the number of images read so far and their total
+OnImage = Callable[[int, int], object]
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
-DAMAGED_IMAGES = {"bearPNG": 20}  # the first 20 of DiLiGenT's Bear are corrupted, as users of the benchmark reported
+# the first 20 of DiLiGenT's Bear are corrupted, as users of the benchmark reported
+DAMAGED_IMAGES = {"bearPNG": 20}
 
 
 @dataclass(frozen=True)
 class TrialSource:
     """A capture that was read once, from which each trial takes its lights.
 
-    Every draw is restored separately: a saturated observation is restored from the other lights of the draw, as
-    `infer` does when it reads only these lights. `rows` are the rows of the observations to score; None for all rows.
+    Every draw is restored separately: a saturated observation is restored from the other lights of
+    the draw, as `infer` does when it reads only these lights. `rows` are the rows of the
+    observations to score; None for all rows.
     """
 
     stored: StoredCapture
     rows: NDArray[np.integer] | None = None
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
-        """Return the capture under the lights of a trial, with noise added, refined or estimated as the trial requires.
+        """Return the capture under the lights of a trial, with noise added, refined or estimated as
+        the trial requires.
 
-        It contains the scored pixels or, with `whole`, all pixels. As in `infer`, lights are refined or estimated from
-        all pixels.
+        It contains the scored pixels or, with `whole`, all pixels. As in `infer`, lights are
+        refined or estimated from all pixels.
         """
         protocol, pixels = trial.protocol, None if whole else self.rows
         seen = self.stored.choose_lights(self.places(trial.lights))
@@ -153,15 +180,22 @@ class TrialSource:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
         if protocol.finds_lights:
             seen = seen.find_lights(partial(find_lights, refuse=False))
-        # The intensities are estimated from all pixels, so this happens before the scored pixels are chosen.
+        # The intensities are estimated from all pixels, so this happens before the scored pixels
+        # are chosen.
         intensities = None if protocol.as_stored else seen.estimate_intensities()
-        needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
+        needs_all = (
+            protocol.finds_lights
+            or protocol.light_error_deg is not None
+            or seen.capture.lamps is not None
+        )
         if pixels is not None and not needs_all:
             seen, pixels = seen.choose_pixels(pixels), None
         capture = seen.capture if protocol.as_stored else seen.restore(intensities)
         if protocol.light_error_deg is not None:
             known = self.stored.intensities_known
-            capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
+            capture = refine_capture(
+                capture, error_deg=protocol.light_error_deg, intensities_known=known
+            )
         if pixels is None:
             return capture
         # Near lamps require the surface, which can only be computed from all pixels together.
@@ -174,7 +208,9 @@ class TrialSource:
 
 
 class SharedDraw:
-    """The capture shared by the methods of one draw. It is computed by the first method that needs it."""
+    """The capture shared by the methods of one draw. It is computed by the first method that needs
+    it.
+    """
 
     def __init__(self, source: TrialSource) -> None:
         self._source = source
@@ -182,12 +218,16 @@ class SharedDraw:
         self._captures: dict[bool, Capture] = {}
 
     def score(
-        self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] = lambda n_pixels: ignore
+        self,
+        trial: Trial,
+        estimator: Estimator,
+        begin: Callable[[int], Progress] = lambda n_pixels: ignore,
     ) -> Score:
         """Return the score of a trial of the draw. Any thread may call this.
 
-        `begin` is called with the number of pixels before they are estimated and returns a function that counts
-        finished pixels. Raises SplinecliError if the method returns normals that are not unit vectors.
+        `begin` is called with the number of pixels before they are estimated and returns a function
+        that counts finished pixels. Raises SplinecliError if the method returns normals that are
+        not unit vectors.
         """
         source, whole = self._source, estimator.needs_capture
         with self._lock:
@@ -195,7 +235,8 @@ class SharedDraw:
                 self._captures[whole] = source.see(trial, whole=whole)
         capture = self._captures[whole]
         estimate = estimate_normals(capture, estimator, progress=begin(capture.n_pixels))
-        assert estimate.errors is not None and estimate.error_map_deg is not None  # otherwise there would be no trials
+        # otherwise there would be no trials
+        assert estimate.errors is not None and estimate.error_map_deg is not None
         mae_deg = estimate.errors.mean
         if source.rows is not None and capture.n_pixels != len(source.rows):
             mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
@@ -203,7 +244,9 @@ class SharedDraw:
         if capture.light_errors_deg is not None:
             true = source.stored.capture.light_directions[source.places(trial.lights)]
             light_error_deg = float(angle_between_deg(capture.light_directions, true).mean())
-        return Score(mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg)
+        return Score(
+            mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg
+        )
 
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:
@@ -211,7 +254,9 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
     generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
     # With few lights and large noise, the lights can become coplanar. Such noise is drawn again.
     for _ in range(100):
-        directions = tilt_lights(capture.light_directions, trial.protocol.light_noise_deg, generator)
+        directions = tilt_lights(
+            capture.light_directions, trial.protocol.light_noise_deg, generator
+        )
         if not in_one_plane(directions):
             break
     lamps = None if capture.lamps is None else capture.lamps.turned(directions)
@@ -221,14 +266,17 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
 def tilt_lights(
     light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3), each rotated by an angle from N(0, sigma_deg) in a random direction.
+    """Return unit light directions (F, 3), each rotated by an angle from N(0, sigma_deg) in a
+    random direction.
 
-    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is rotated the
-    opposite way and stays above it, so that all directions are valid for a capture.
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <=
+    0) is rotated the opposite way and stays above it, so that all directions are valid for a
+    capture.
     """
     n_lights = len(light_directions)
     angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-89.0, 89.0))
-    # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
+    # A Gaussian vector without its part along the light: every perpendicular direction is equally
+    # likely.
     across = generator.normal(size=(n_lights, 3))
     along = np.einsum("fi,fi->f", across, light_directions)
     across = unit(across - along[:, None] * light_directions)
@@ -243,12 +291,18 @@ class CaptureReading:
 
     folder: Path  # the capture's folder as given; other processes open it again
     name: str
-    protocols: tuple[Protocol, ...]  # the protocols that can score it; they all score the same pixels
+    # the protocols that can score it; they all score the same pixels
+    protocols: tuple[Protocol, ...]
     lights: tuple[int, ...]  # the lights used by any trial, in ascending order
-    whole: bool  # whether all pixels are needed: a method uses them, or lights are refined or estimated
+    # whether all pixels are needed: a method uses them, or lights are refined or estimated
+    whole: bool
 
-    def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
-        """Return the capture under all lights, and the notes on it, by protocol. Raises InputError, UsageError."""
+    def read(
+        self, source: CaptureSource, on_image: OnImage = lambda *_: None
+    ) -> tuple[TrialSource, Notes]:
+        """Return the capture under all lights, and the notes on it, by protocol. Raises InputError,
+        UsageError.
+        """
         numbers, as_stored = count(1), all(protocol.as_stored for protocol in self.protocols)
         try:
             stored = source.read_stored(
@@ -260,8 +314,13 @@ class CaptureReading:
         pixels = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
         if len(pixels) == stored.capture.n_pixels:
             trials = TrialSource(stored)
-        elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
-            # `infer` estimates unknown intensities from all pixels, and near lamps require the whole surface.
+        elif (
+            self.whole
+            or stored.capture.lamps is not None
+            or not (as_stored or stored.intensities_known)
+        ):
+            # `infer` estimates unknown intensities from all pixels, and near lamps require the
+            # whole surface.
             trials = TrialSource(stored, pixels)
         else:
             trials = TrialSource(stored.choose_pixels(pixels))
@@ -288,25 +347,35 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
             f"{name}: the first {damaged} images are known to be damaged and are used;"
             f" --skip-first {name}={damaged} leaves them out."
         )
-    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.kind == GROUND_TRUTH_UPSIDE_DOWN]
+    notes += [
+        f"{name}: {warning}"
+        for warning in capture.warnings
+        if warning.kind == GROUND_TRUTH_UPSIDE_DOWN
+    ]
     if capture.ground_truth is not None:
         sample = sample_observations(capture.observations, capture.mask)
         wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
         notes += [f"{name}: {warning}" for warning in wrong]
-        without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
+        without = capture.n_pixels - int(
+            np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1))
+        )
         if without:
             notes.append(
-                f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth normal"
+                f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth"
+                " normal"
                 " and are not scored."
             )
     return tuple(notes)
 
 
-def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
+def scored_rows(
+    capture: Capture, *, max_pixels: int | None = None, seed: int = 0
+) -> NDArray[np.intp]:
     """Return the rows of the observations that have ground truth, in rising order.
 
-    With `max_pixels`, at most that many are chosen by the seed, the same for every method and trial. A method that uses
-    neighbours estimates all pixels, but only these are scored. Raises InputError without ground truth.
+    With `max_pixels`, at most that many are chosen by the seed, the same for every method and
+    trial. A method that uses neighbours estimates all pixels, but only these are scored. Raises
+    InputError without ground truth.
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")

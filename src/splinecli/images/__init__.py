@@ -1,1 +1,3 @@
-"""Information missing from image values: white level, saturated values, mask, intensities and colours of lamps."""
+"""Information missing from image values: white level, saturated values, mask, intensities and
+colours of lamps.
+"""

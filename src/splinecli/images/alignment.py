@@ -1,12 +1,13 @@
 """Register images that moved between exposures, without being misled by the changing light.
 
-All images are compared with a matte surface under their lights, I = l . b, so that the light's effect on the
-images is part of the model. The transforms, and small corrections of the lights, minimise the robust residuals of this
-model jointly, by Gauss-Newton steps in which every pixel's b is eliminated (variable projection). This is the batch
-alignment of Y. Peng, A. Ganesh, J. Wright, W. Xu, Y. Ma, "RASL: Robust alignment by sparse and low-rank decomposition",
-TPAMI 2012, with the known lights instead of an unknown subspace. The images are high-pass filtered, which keeps the
-model linear and removes most of the gloss. The first shifts come from correlations of the gradients of images with
-similar lights.
+All images are compared with a matte surface under their lights, I = l . b, so that the light's
+effect on the images is part of the model. The transforms, and small corrections of the lights,
+minimise the robust residuals of this model jointly, by Gauss-Newton steps in which every pixel's b
+is eliminated (variable projection). This is the batch alignment of Y. Peng, A. Ganesh, J. Wright,
+W. Xu, Y. Ma, "RASL: Robust alignment by sparse and low-rank decomposition", TPAMI 2012, with the
+known lights instead of an unknown subspace. The images are high-pass filtered, which keeps the
+model linear and removes most of the gloss. The first shifts come from correlations of the gradients
+of images with similar lights.
 """
 
 from __future__ import annotations
@@ -24,28 +25,40 @@ Model = Literal["translation", "similarity", "homography"]
 PARAMETERS: dict[Model, int] = {"translation": 2, "similarity": 4, "homography": 8}
 
 MIN_IMAGES = 5
-"""A pixel's b has three unknowns, so four images leave only one residual; they were misaligned by pixels in trials."""
+"""A pixel's b has three unknowns, so four images leave only one residual; they were misaligned by
+pixels in trials.
+"""
 
 MOST_VALUES = 40_000_000
 """Images are reduced until they have at most so many pixels together: 160 MiB."""
 
 LEAST_FIT, CLEAR_FIT, MOST_UNLIKE = 0.3, 0.8, 3.0
-"""An image does not fit if its correlation with its prediction from the others is below CLEAR_FIT, and farther from 1
-than the median correlation by the factor MOST_UNLIKE, because images with little detail fit badly, but alike. A median
-below LEAST_FIT leaves nothing to align by: it is 0.05 to 0.25 on a real ball, and 0.44 to 0.95 on two statues."""
+"""An image does not fit if its correlation with its prediction from the others is below CLEAR_FIT,
+and farther from 1 than the median correlation by the factor MOST_UNLIKE, because images with little
+detail fit badly, but alike. A median below LEAST_FIT leaves nothing to align by: it is 0.05 to 0.25
+on a real ball, and 0.44 to 0.95 on two statues."""
 
 LARGEST_MOTION = 0.35  # of a pixel, as a share of the object's longer side
 UNMOVED = 0.1  # pixels; a capture in which no image moved by more is left as it is
 
 _REACH = 0.25  # of the first shifts, as a share of the object's shorter side
-_SMALLEST_SIDE, _SIDE_OF_FIRST = 20, 128  # pixels of the object on the coarsest level, and of images for first shifts
+# pixels of the object on the coarsest level, and of images for first shifts
+_SMALLEST_SIDE, _SIDE_OF_FIRST = (
+    20,
+    128,
+)
 _NEIGHBOURS = 8  # images with similar lights that each image is compared with for its first shift
 _HIGH_PASS, _LOW_PASS = 3.0, 0.7  # standard deviations in pixels
 _MOST_OBSERVATIONS = 600_000  # on a level
 _LIGHT_SIGMA, _BRIGHTNESS_SIGMA = 0.05, 0.3  # expected relative errors of the given lights
-_CORRELATED = 300.0  # neighbouring residuals are correlated: so many weigh as much as one against a prior
+# neighbouring residuals are correlated: so many weigh as much as one against a prior
+_CORRELATED = 300.0
 _RIDGE = 0.02  # share of a pixel's weights, pulls its b to zero
-_SMALLEST_ENERGY, _CUT = 1e-3, 2.0  # of a pixel's features, and residual with half of the weight, see _Fit
+# of a pixel's features, and residual with half of the weight, see _Fit
+_SMALLEST_ENERGY, _CUT = (
+    1e-3,
+    2.0,
+)
 _DARK, _SHADOW_WEIGHT = 0.1, 0.05
 _STEPS, _TRIALS = 15, 4
 _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by this factor
@@ -55,8 +68,8 @@ _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by thi
 class Alignment:
     """How images moved against the first one, in pixels: x is the column, y the row.
 
-    transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each image.
-    moved_pixels: (F,), the root mean square motion over the object.
+    transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each
+    image. moved_pixels: (F,), the root mean square motion over the object.
     fits: (F,), the correlation of the aligned image with its prediction from the others.
     """
 
@@ -89,14 +102,19 @@ def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None)
     """
     pyramid = list(_pyramid(images, mask))
     start = _State(np.repeat(np.eye(3)[None], len(images), 0), _first_lights(*pyramid[-1], lights))
-    number = next((n for n, (_, each) in enumerate(pyramid) if max(each.shape) <= _SIDE_OF_FIRST), len(pyramid) - 1)
+    number = next(
+        (n for n, (_, each) in enumerate(pyramid) if max(each.shape) <= _SIDE_OF_FIRST),
+        len(pyramid) - 1,
+    )
     start.transforms[:, :2, 2] = 2.0**number * _first_shifts(*pyramid[number], start.lights)
     prior = 0.1 if lights is not None else 1e-3
     # The model is chosen on a level of half the resolution, where all of them are quick.
     first = min(1, len(pyramid) - 1)
     found = {model: _solve(pyramid, first, start, PARAMETERS[model], prior) for model in PARAMETERS}
     scale = found["homography"][0].scale
-    costs = {model: level.cost(level.data, level.lights, scale) for model, (level, _) in found.items()}
+    costs = {
+        model: level.cost(level.data, level.lights, scale) for model, (level, _) in found.items()
+    }
     model: Model = "translation"
     for richer in ("similarity", "homography"):
         if costs[model] > _SIMPLER * costs[richer]:
@@ -107,7 +125,9 @@ def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None)
     return _described(model, state.transforms, mask, level.correlations())
 
 
-def _described(model: Model, transforms: Float64Array, mask: Bools, fits: Float64Array) -> Alignment:
+def _described(
+    model: Model, transforms: Float64Array, mask: Bools, fits: Float64Array
+) -> Alignment:
     rows, columns = np.nonzero(mask)
     places = np.stack((columns, rows, np.ones_like(rows))).astype(np.float64)
     moved, largest = [], 0.0
@@ -133,8 +153,11 @@ def common_pixels(transforms: Float64Array, shape: Sequence[int]) -> Bools:
     return common
 
 
-def resample(stored: Array, linear: Float32Array, transform: Float64Array) -> tuple[Array, Float32Array]:
-    """Return an image (H, W, C) in the frame of the reference: as stored, from the nearest pixel, and interpolated.
+def resample(
+    stored: Array, linear: Float32Array, transform: Float64Array
+) -> tuple[Array, Float32Array]:
+    """Return an image (H, W, C) in the frame of the reference: as stored, from the nearest pixel,
+    and interpolated.
 
     Stored values decide which observations are saturated, so they are not mixed.
     """
@@ -145,9 +168,15 @@ def resample(stored: Array, linear: Float32Array, transform: Float64Array) -> tu
     if np.array_equal(transform, np.eye(3)):
         return stored, linear
     flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LANCZOS4
-    moved = cv2.warpPerspective(linear, transform, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    there = transform @ np.stack((*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))), 1)
-    columns, rows = (np.rint(axis / there[:, 2]).astype(np.intp) for axis in (there[:, 0], there[:, 1]))
+    moved = cv2.warpPerspective(
+        linear, transform, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    there = transform @ np.stack(
+        (*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))), 1
+    )
+    columns, rows = (
+        np.rint(axis / there[:, 2]).astype(np.intp) for axis in (there[:, 0], there[:, 1])
+    )
     nearest = stored[rows.clip(0, height - 1), columns.clip(0, width - 1)]
     return nearest, np.maximum(moved, 0).reshape(linear.shape)
 
@@ -158,7 +187,8 @@ class AlignedImages:
 
     reference: str  # the image in whose frame everything is
     model: Model
-    transforms: Float64Array  # (F, 3, 3) of all images, from the reference to each image; see Alignment
+    # (F, 3, 3) of all images, from the reference to each image; see Alignment
+    transforms: Float64Array
     moved_pixels: Float64Array  # (f,) of the images that are used
     common: Bools  # (H, W) of the part that is read: the pixels that all images show
 
@@ -178,7 +208,9 @@ def stride_for(n_values: int) -> int:
 
 
 def reduced(image: Float32Array, stride: int) -> Float32Array:
-    """Return an image (H, W) with the means of squares of stride x stride pixels; the rest at the borders is cut."""
+    """Return an image (H, W) with the means of squares of stride x stride pixels; the rest at the
+    borders is cut.
+    """
     height, width = (side // stride for side in image.shape)
     squares = image[: height * stride, : width * stride].reshape(height, stride, width, stride)
     return np.asarray(squares.mean(axis=(1, 3)), np.float32)
@@ -187,7 +219,9 @@ def reduced(image: Float32Array, stride: int) -> Float32Array:
 def place_in_whole(transforms: Float64Array, left: int, top: int, stride: int) -> Float64Array:
     """Return transforms (F, 3, 3) of reduced windows as transforms of whole images."""
     middle = (stride - 1) / 2
-    to_whole = np.array([[stride, 0, left + middle], [0, stride, top + middle], [0, 0, 1]], np.float64)
+    to_whole = np.array(
+        [[stride, 0, left + middle], [0, stride, top + middle], [0, 0, 1]], np.float64
+    )
     moved = to_whole @ transforms @ np.linalg.inv(to_whole)
     return np.asarray(moved / moved[:, 2:, 2:])
 
@@ -210,7 +244,9 @@ def _pyramid(images: Float32Array, mask: Bools) -> Iterator[tuple[Float32Array, 
 
 
 def _first_lights(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Float64Array:
-    """Return the lights with intensities that fit the unaligned images; without lights, three singular vectors."""
+    """Return the lights with intensities that fit the unaligned images; without lights, three
+    singular vectors.
+    """
     values = images[:, mask].astype(np.float64)
     if lights is None:
         left, sizes, _ = np.linalg.svd(values, full_matrices=False)
@@ -224,7 +260,9 @@ def _first_lights(images: Float32Array, mask: Bools, lights: Float64Array | None
 
 
 def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Float64Array:
-    """Return the shifts (F, 2) of images against the first, from correlations of images with similar lights."""
+    """Return the shifts (F, 2) of images against the first, from correlations of images with
+    similar lights.
+    """
     import cv2
     from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -234,7 +272,8 @@ def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Fl
     shape = [next_fast_len(side + reach, real=True) for side in mask.shape]
     spectra = []
     for image in images:
-        # Sizes of gradients of logarithms: a contour looks alike under similar lights, and paint under all.
+        # Sizes of gradients of logarithms: a contour looks alike under similar lights, and paint
+        # under all.
         down, right = np.gradient(cv2.GaussianBlur(np.log(image.clip(0) + 0.05), (0, 0), _LOW_PASS))
         size = np.hypot(down, right)
         size = np.minimum(size, np.quantile(size[area], 0.95))
@@ -257,27 +296,42 @@ def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Fl
     incidence[np.arange(len(pairs)), first] -= 1
     weight = given
     for _ in range(30):  # least absolute deviations, because some pairs do not match
-        normal = incidence[:, 1:].T @ (weight[:, None] * incidence[:, 1:]) + 1e-9 * np.eye(count - 1)
+        normal = incidence[:, 1:].T @ (weight[:, None] * incidence[:, 1:]) + 1e-9 * np.eye(
+            count - 1
+        )
         found[1:] = np.linalg.solve(normal, incidence[:, 1:].T @ (weight[:, None] * between))
         weight = given / np.maximum(np.linalg.norm(incidence @ found - between, axis=1), 0.5)
     return found
 
 
 def _solve(
-    pyramid: Sequence[tuple[Float32Array, Bools]], last: int, state: _State, parameters: int, prior: float
+    pyramid: Sequence[tuple[Float32Array, Bools]],
+    last: int,
+    state: _State,
+    parameters: int,
+    prior: float,
 ) -> tuple[_Level, _State]:
     """Return the finest level that was solved, and the state in pixels of the images."""
     for number in reversed(range(last, len(pyramid))):
         images, mask = pyramid[number]
         scale = np.diag((2.0**number, 2.0**number, 1.0))
-        level = _Level(images, mask, np.linalg.inv(scale) @ state.transforms @ scale, state.lights, parameters, prior)
+        level = _Level(
+            images,
+            mask,
+            np.linalg.inv(scale) @ state.transforms @ scale,
+            state.lights,
+            parameters,
+            prior,
+        )
         level.minimise()
         state = _State(scale @ level.transforms @ np.linalg.inv(scale), level.lights)
     return level, state
 
 
 class _Features(NamedTuple):
-    """Features of a level, each (F, P): high-pass filtered images, their gradients, brightness, and known pixels."""
+    """Features of a level, each (F, P): high-pass filtered images, their gradients, brightness, and
+    known pixels.
+    """
 
     values: Float32Array
     right: Float32Array
@@ -287,7 +341,9 @@ class _Features(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The matte model of a state: weights (F, P), a root of b's covariance (3, 3, P), b (3, P), residuals (F, P)."""
+    """The matte model of a state: weights (F, P), a root of b's covariance (3, 3, P), b (3, P),
+    residuals (F, P).
+    """
 
     lit: Floats  # the weights before the robust fit
     weights: Floats
@@ -300,7 +356,9 @@ class _Fit(NamedTuple):
 
 @dataclass(eq=False)
 class _Level:
-    """Images (F, H, W) of a pyramid, the object's mask (H, W) in the first one, and the state that is improved."""
+    """Images (F, H, W) of a pyramid, the object's mask (H, W) in the first one, and the state that
+    is improved.
+    """
 
     images: Float32Array
     mask: Bools
@@ -314,12 +372,15 @@ class _Level:
     def __post_init__(self) -> None:
         import cv2
 
-        rows, columns = np.nonzero(cv2.dilate(self.mask.astype(np.uint8), np.ones((5, 5))))  # with the outline
+        # with the outline
+        rows, columns = np.nonzero(cv2.dilate(self.mask.astype(np.uint8), np.ones((5, 5))))
         stride = int(np.ceil(len(rows) * len(self.images) / _MOST_OBSERVATIONS))
         self._at = rows[::stride], columns[::stride]
         middle = columns.mean(), rows.mean()
         self._radius = max(1.0, 0.5 * max(np.ptp(columns), np.ptp(rows)))
-        self._to_unit = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, self._radius]]) / self._radius
+        self._to_unit = (
+            np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, self._radius]]) / self._radius
+        )
         x, y = (self._at[1] - middle[0]) / self._radius, (self._at[0] - middle[1]) / self._radius
         one, zero = np.ones_like(x), np.zeros_like(x)
         # The motion of a pixel by each parameter, and the same as matrices.
@@ -351,12 +412,18 @@ class _Level:
                 return
 
     def correlations(self) -> Float64Array:
-        """Return the correlation (F,) of each image with its prediction from the others, over the lit pixels."""
+        """Return the correlation (F,) of each image with its prediction from the others, over the
+        lit pixels.
+        """
         fit = self._fit(self.data, self.lights)
         values = self.data.values.astype(np.float64)
         leverage = fit.weights * sum((self.lights @ axis) ** 2 for axis in fit.root)
-        predicted = values - fit.left / np.maximum(1 - leverage, 1e-3)  # the residual without the image itself
-        sums = ((fit.lit * a * b).sum(axis=1) for a, b in ((values, predicted), (values, values), (predicted,) * 2))
+        # the residual without the image itself
+        predicted = values - fit.left / np.maximum(1 - leverage, 1e-3)
+        sums = (
+            (fit.lit * a * b).sum(axis=1)
+            for a, b in ((values, predicted), (values, values), (predicted,) * 2)
+        )
         products, squares, others = sums
         return np.asarray(products / np.sqrt(squares * others + 1e-30))
 
@@ -372,19 +439,28 @@ class _Level:
         for image, transform in zip(self.images, transforms, strict=True):
             flags = cv2.WARP_INVERSE_MAP
             raw = cv2.warpPerspective(
-                image, transform, size, flags=flags | cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+                image,
+                transform,
+                size,
+                flags=flags | cv2.INTER_CUBIC,
+                borderMode=cv2.BORDER_REPLICATE,
             )
             known = cv2.warpPerspective(ones, transform, size, flags=flags | cv2.INTER_NEAREST)
-            values = cv2.GaussianBlur(raw - cv2.GaussianBlur(raw, (0, 0), _HIGH_PASS), (0, 0), _LOW_PASS)
+            values = cv2.GaussianBlur(
+                raw - cv2.GaussianBlur(raw, (0, 0), _HIGH_PASS), (0, 0), _LOW_PASS
+            )
             down, right = np.gradient(values)
             for column, each in zip(found, (values, right, down, raw, known), strict=True):
                 column.append(each[self._at])
         return _Features(*map(np.stack, found))
 
-    def _fit(self, data: _Features, lights: Float64Array, scale: Float64Array | None = None) -> _Fit:
+    def _fit(
+        self, data: _Features, lights: Float64Array, scale: Float64Array | None = None
+    ) -> _Fit:
         """Fit the matte model robustly, with Cauchy's weights.
 
-        A residual counts in relation to the energy of its pixel's features, because most pixels have none.
+        A residual counts in relation to the energy of its pixel's features, because most pixels
+        have none.
         """
         raw, values = data.raw, data.values
         bright = max(1, len(raw) // 8)  # highlights
@@ -396,7 +472,8 @@ class _Level:
             left = _matte(values, weights, lights)[2]
             sums = (weights * values**2).sum(axis=0), np.maximum(weights.sum(axis=0), 1e-6)
             energy = np.sqrt(sums[0] / sums[1]) + _SMALLEST_ENERGY
-            # The median of each image: an image that is still far from the others must not look like outliers.
+            # The median of each image: an image that is still far from the others must not look
+            # like outliers.
             shares = _medians(np.where(weights > 0.3, np.abs(left) / energy, np.nan))
             found = _CUT * 1.4826 * np.maximum(shares, 1e-6)[:, None] * energy
             weights = lit / (1 + (left / found) ** 2)
@@ -410,7 +487,9 @@ class _Level:
         return _Fit(lit, weights, root, surface, left, scale, cost)
 
     def _equations(self, fit: _Fit) -> tuple[Float64Array, Float64Array, float]:
-        """Return the normal equations of all images' parameters and lights, without b, and the weight of a prior."""
+        """Return the normal equations of all images' parameters and lights, without b, and the
+        weight of a prior.
+        """
         weights, lights, count = fit.weights, self.lights, len(self.images)
         each = self.parameters + 3
         size = count * each
@@ -436,7 +515,9 @@ class _Level:
         for place, given in enumerate(self._given):
             length = max(float(np.linalg.norm(given)), 1e-6)
             along = np.outer(given, given) / length**2
-            precision = (np.eye(3) - along) / (_LIGHT_SIGMA * length) ** 2 + along / (_BRIGHTNESS_SIGMA * length) ** 2
+            precision = (np.eye(3) - along) / (_LIGHT_SIGMA * length) ** 2 + along / (
+                _BRIGHTNESS_SIGMA * length
+            ) ** 2
             rows = slice(place * each + self.parameters, place * each + each)
             matrix[rows, rows] += self.prior * unit * precision
             gradient[rows] += self.prior * unit * precision @ (lights[place] - given)
@@ -445,20 +526,33 @@ class _Level:
     def _moved(
         self, matrix: Float64Array, gradient: Float64Array, damping: float
     ) -> tuple[Float64Array, Float64Array, float]:
-        """Return transforms and lights after a step, and the largest motion. The first image stays."""
+        """Return transforms and lights after a step, and the largest motion.
+        The first image stays.
+        """
         count, each, free = len(self.images), self.parameters + 3, slice(self.parameters, None)
-        # Motions relative to their mean are damped: the others together move against the first image as one image does.
+        # Motions relative to their mean are damped: the others together move against the first
+        # image as one image does.
         motion = np.kron(np.eye(count) - 1 / count, np.diag(np.arange(each) < self.parameters))
-        damped = matrix + damping * motion + np.eye(len(matrix)) * (1e-9 * np.trace(matrix) / len(matrix) + 1e-12)
+        damped = (
+            matrix
+            + damping * motion
+            + np.eye(len(matrix)) * (1e-9 * np.trace(matrix) / len(matrix) + 1e-12)
+        )
         step = np.zeros(len(gradient))
         step[free] = -np.linalg.solve(damped[free, free], gradient[free])
         steps = step.reshape(count, each)
         limit = max(2.0, 0.1 * self._radius)
         moves = steps[:, : self.parameters]
-        moves = moves * np.minimum(1, limit / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-12))
+        moves = moves * np.minimum(
+            1, limit / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-12)
+        )
         small = np.eye(3) + np.tensordot(moves / self._radius, _GENERATORS[: self.parameters], 1)
         transforms = self.transforms @ np.linalg.inv(self._to_unit) @ small @ self._to_unit
-        return transforms / transforms[:, 2:, 2:], self.lights + steps[:, self.parameters :], float(np.abs(moves).max())
+        return (
+            transforms / transforms[:, 2:, 2:],
+            self.lights + steps[:, self.parameters :],
+            float(np.abs(moves).max()),
+        )
 
 
 _GENERATORS = np.array(
@@ -474,17 +568,25 @@ _GENERATORS = np.array(
     ],
     np.float64,
 )
-"""Small motions of points of the plane as matrices: shifts, rotation, scale, two shears, and two of perspective."""
+"""Small motions of points of the plane as matrices: shifts, rotation, scale, two shears, and two of
+perspective.
+"""
 
 
 def _medians(shares: Float64Array) -> Float64Array:
-    """Return the medians (F,) of shares (F, P) without NaN; an image of NaN alone gets the median of all."""
+    """Return the medians (F,) of shares (F, P) without NaN; an image of NaN alone gets the median
+    of all.
+    """
     usual = float(np.nanmedian(shares)) if not np.isnan(shares).all() else 1.0
     return np.array([np.nanmedian(row) if not np.isnan(row).all() else usual for row in shares])
 
 
-def _matte(values: Floats, weights: Floats, lights: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return a root (3, 3, P) of the covariance of b, b (3, P), and the residuals (F, P) of values (F, P) = l . b."""
+def _matte(
+    values: Floats, weights: Floats, lights: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return a root (3, 3, P) of the covariance of b, b (3, P), and the residuals (F, P) of values
+    (F, P) = l . b.
+    """
     x, y, z = lights.T
     xx, yy, zz, *mixed = np.stack((x * x, y * y, z * z, x * y, x * z, y * z)) @ weights
     ridge = _RIDGE * weights.sum(axis=0) / 3 * float((lights**2).sum(axis=1).mean())

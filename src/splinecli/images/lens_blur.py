@@ -1,8 +1,10 @@
-"""Blur by the lens and the Bayer pattern: how wide it is in the images of a capture, and observations without it.
+"""Blur by the lens and the Bayer pattern: how wide it is in the images of a capture, and
+observations without it.
 
-A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because it fills shadows,
-flattens highlights and mixes the outline with the background. Its width is estimated from the images alone: edges of
-shadows and highlights, and the outline of the object, are steps on any surface. A Wiener filter then inverts the blur.
+A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because
+it fills shadows, flattens highlights and mixes the outline with the background. Its width is
+estimated from the images alone: edges of shadows and highlights, and the outline of the object, are
+steps on any surface. A Wiener filter then inverts the blur.
 """
 
 from __future__ import annotations
@@ -14,45 +16,71 @@ from numpy.typing import NDArray
 
 from splinecli.maths import Bools, Float32Array, Float64Array
 
-REACH = 6  # pixels around the object that the filter mixes with it, and half of the filter's side minus one
+# pixels around the object that the filter mixes with it, and half of the filter's side minus one
+REACH = 6
 WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
-# Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8 bits and JPEG.
+# Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8
+# bits and JPEG.
 NOISE = 0.005
 _SQUARES, _SIDE = 16, 128  # a capture with more pixels is only analysed in this many squares
 
-# benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and the coefficients of
-# a quadratic polynomial of the five.
+# benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and
+# the coefficients of a quadratic polynomial of the five.
 _MEANS = (0.5511, 0.6893, 0.5505, 0.1675, 0.01223)
 _DEVIATIONS = (0.1537, 0.1952, 0.2823, 0.2043, 0.1355)
 _COEFFICIENTS = (
-    0.5471, 0.08626, -0.2653, 0.08725, 0.1342, -0.1189, -0.04015, 0.01734, -0.02201, 0.01165, 0.01648,
-    -0.04393, -0.09538, 0.01304, -0.0863, -0.02431, -0.01935, -0.04998, 0.09267, -0.06995, 0.0123,
-)  # fmt: skip
+    0.5471,
+    0.08626,
+    -0.2653,
+    0.08725,
+    0.1342,
+    -0.1189,
+    -0.04015,
+    0.01734,
+    -0.02201,
+    0.01165,
+    0.01648,
+    -0.04393,
+    -0.09538,
+    0.01304,
+    -0.0863,
+    -0.02431,
+    -0.01935,
+    -0.04998,
+    0.09267,
+    -0.06995,
+    0.0123,
+)
 
 
 def surroundings(mask: Bools) -> Bools:
-    """Return the pixels (H, W) around a mask that remove_blur needs; none of them is in the mask."""
+    """Return the pixels (H, W) around a mask that remove_blur needs;
+    none of them is in the mask.
+    """
     return _grown(mask, REACH) & ~mask
 
 
 def _grown(mask: Bools, reach: int) -> Bools:
     import cv2
 
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
+    return np.asarray(
+        cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    )
 
 
 def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float | None:
     """Sharpen observations in place; return the estimated blur, or None if it is negligible.
 
-    The observations (P + R, F) are of the P pixels of a mask (H, W), then of the R pixels around it (H, W), which keep
-    their values; see surroundings. The blur is its standard deviation along either axis, in pixels.
+    The observations (P + R, F) are of the P pixels of a mask (H, W), then of the R pixels around it
+    (H, W), which keep their values; see surroundings. The blur is its standard deviation along
+    either axis, in pixels.
     """
     import cv2
 
     rows, n_pixels = pixel_rows(mask, around), np.count_nonzero(mask)
     numbers = edge_numbers(observations, mask, rows)
-    # A higher correlation of gradients at a distance of three pixels shows shading alone, and no edge. No blur of up to
-    # WIDEST_SIGMA reaches it.
+    # A higher correlation of gradients at a distance of three pixels shows shading alone, and no
+    # edge. No blur of up to WIDEST_SIGMA reaches it.
     if numbers is None or numbers[-1] > 0.5:
         return None
     terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
@@ -64,7 +92,9 @@ def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float
 
     def sharpen(light: int) -> None:
         image = np.where(rows < 0, np.float32(0), observations[rows, light])
-        observations[:n_pixels, light] = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)[inside]
+        observations[:n_pixels, light] = cv2.filter2D(
+            image, -1, kernel, borderType=cv2.BORDER_REPLICATE
+        )[inside]
 
     with ThreadPoolExecutor(2, "sharpen") as pool:
         list(pool.map(sharpen, range(observations.shape[1])))
@@ -72,7 +102,9 @@ def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float
     return sigma
 
 
-def polynomial(numbers: Float64Array, means: Float64Array, deviations: Float64Array) -> Float64Array:
+def polynomial(
+    numbers: Float64Array, means: Float64Array, deviations: Float64Array
+) -> Float64Array:
     """Return 1, the standardised numbers (..., N) and their products, (..., (N + 1)(N + 2) / 2)."""
     standard = ((numbers - means) / deviations).clip(-3, 3)
     with_one = np.concatenate((np.ones_like(standard[..., :1]), standard), axis=-1)
@@ -81,13 +113,18 @@ def polynomial(numbers: Float64Array, means: Float64Array, deviations: Float64Ar
 
 
 def _widest_at(correlation: float) -> float:
-    """Return the widest blur at which gradients of neighbouring pixels have no more than this correlation.
+    """Return the widest blur at which gradients of neighbouring pixels have no more than this
+    correlation.
 
-    Among surfaces behind the same blur, the correlation is lowest if the pixels are independent of each other. The
-    captures to which the polynomial was fitted do not have such fine texture.
+    Among surfaces behind the same blur, the correlation is lowest if the pixels are independent of
+    each other. The captures to which the polynomial was fitted do not have such fine texture.
     """
     sigmas = np.linspace(0.05, 2, 200)
-    one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)  # of the values, at one and two pixels
+    # of the values, at one and two pixels
+    one, two = (
+        np.exp(-1 / (4 * sigmas**2)),
+        np.exp(-1 / sigmas**2),
+    )
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
     return float(np.interp(correlation + 0.1, of_gradients, sigmas))
 
@@ -95,34 +132,41 @@ def _widest_at(correlation: float) -> float:
 def inverse_filter(sigma: float) -> Float32Array:
     """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
 
-    Of all filters of this size it has the least mean square error (Wiener's criterion) for white noise and images whose
-    power falls with the square of the frequency, as it does for edges.
+    Of all filters of this size it has the least mean square error (Wiener's criterion) for white
+    noise and images whose power falls with the square of the frequency, as it does for edges.
     """
     frequencies = np.arange(33) / 64
     places = np.arange(REACH + 1)
     waves = np.cos(2 * np.pi * frequencies[:, None] * places) * np.where(places > 0, 2, 1)
-    terms = np.kron(waves, waves)  # the transfer function of each weight in a quadrant of the filter
+    # the transfer function of each weight in a quadrant of the filter
+    terms = np.kron(waves, waves)
     squared = (frequencies[:, None] ** 2 + frequencies**2).ravel()
     passed = np.exp(-2 * (np.pi * sigma) ** 2 * squared)
     power = 1 / squared.clip(min=frequencies[1] ** 2)
     power /= power.mean()
-    weights = np.linalg.solve((terms.T * (power * passed**2 + NOISE)) @ terms, terms.T @ (power * passed))
+    weights = np.linalg.solve(
+        (terms.T * (power * passed**2 + NOISE)) @ terms, terms.T @ (power * passed)
+    )
     mirrored = np.abs(np.arange(-REACH, REACH + 1))
     kernel = weights.reshape(REACH + 1, -1)[mirrored[:, None], mirrored]
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32]) -> Float64Array | None:
-    """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too few edges.
+def edge_numbers(
+    observations: Float32Array, mask: Bools, rows: NDArray[np.int32]
+) -> Float64Array | None:
+    """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too
+    few edges.
 
-    Along rows and columns, the share that a local maximum of the gradient has in the sum with its two neighbours: the
-    lower and the upper quartile over the steepest ones. A step between two pixels has 1; behind a blur of 0.7 pixels,
-    it has 0.58. Then the correlation of the gradients of neighbouring pixels between different images, which noise does
-    not change, and of gradients at a distance of two and three pixels in the same image.
+    Along rows and columns, the share that a local maximum of the gradient has in the sum with its
+    two neighbours: the lower and the upper quartile over the steepest ones. A step between two
+    pixels has 1; behind a blur of 0.7 pixels, it has 0.58. Then the correlation of the gradients of
+    neighbouring pixels between different images, which noise does not change, and of gradients at a
+    distance of two and three pixels in the same image.
 
-    See remove_blur for the observations and the mask, and pixel_rows for the rows. The object and a narrow strip around
-    it are analysed, in few images and, in large captures, in few squares. Values above the 0.95 quantile are clipped,
-    so that highlights do not dominate.
+    See remove_blur for the observations and the mask, and pixel_rows for the rows. The object and a
+    narrow strip around it are analysed, in few images and, in large captures, in few squares.
+    Values above the 0.95 quantile are clipped, so that highlights do not dominate.
     """
     n_pixels = np.count_nonzero(mask)
     chosen = observations[:, :: -(-observations.shape[1] // 12)]  # of at most 12 images
@@ -130,9 +174,10 @@ def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32
     region = _grown(mask, 4)
     boxes = _looked_at(mask, region)
     parts, inside = np.stack([rows[box] for box in boxes]), np.stack([region[box] for box in boxes])
+    # (T, F, h, w)
     images = np.moveaxis(
         (chosen[parts] / np.float32(level)).clip(max=1) * (parts >= 0)[..., None], 3, 1
-    )  # (T, F, h, w)
+    )
     edges, shares, across, pairs, square, two, three = [], [], 0.0, 0.0, 0.0, 0.0, 0.0
     for axis in (2, 3):
         lines, whole = np.moveaxis(images, axis, 3), np.moveaxis(inside, axis - 1, 2)
@@ -146,7 +191,9 @@ def edge_numbers(observations: Float32Array, mask: Bools, rows: NDArray[np.int32
         edges.append(sums[peaks])
         shares.append(size[peaks] / sums[peaks])
         total = steps.sum(axis=1)
-        across += _product(total[..., 1:], total[..., :-1]) - _product(steps[..., 1:], steps[..., :-1])
+        across += _product(total[..., 1:], total[..., :-1]) - _product(
+            steps[..., 1:], steps[..., :-1]
+        )
         pairs += _product(total, total)
         square += _product(steps, steps)
         two += _product(steps[..., 2:], steps[..., :-2])
@@ -173,11 +220,15 @@ def pixel_rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
 
 
 def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
-    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of one size."""
+    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of one
+    size.
+    """
     box = _box(region, 0)
     if region[box].size <= _SQUARES * _SIDE**2:
         return [box]
-    places = np.flatnonzero(mask)[np.linspace(0, np.count_nonzero(mask) - 1, _SQUARES + 2).astype(int)[1:-1]]
+    places = np.flatnonzero(mask)[
+        np.linspace(0, np.count_nonzero(mask) - 1, _SQUARES + 2).astype(int)[1:-1]
+    ]
     corners = np.stack(np.divmod(places, mask.shape[1]), axis=1) - _SIDE // 2
     corners = corners.clip(0, np.maximum(np.array(mask.shape) - _SIDE, 0))
     return [(slice(y, y + _SIDE), slice(x, x + _SIDE)) for y, x in corners.tolist()]

@@ -1,9 +1,11 @@
-"""Information missing from image values: the white level, saturated observations, and the mask of the object.
+"""Information missing from image values: the white level, saturated observations, and the mask of
+the object.
 
-The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14 bits often store
-their values in 16-bit files without scaling them, so that nothing ever reaches the file's full scale. Clipping still
-shows in the values. Many observations share the images' exact maximum, and far fewer have the values just below it. On
-a smooth surface without clipping, the maximum is no more frequent than they are.
+The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14
+bits often store their values in 16-bit files without scaling them, so that nothing ever reaches the
+file's full scale. Clipping still shows in the values. Many observations share the images' exact
+maximum, and far fewer have the values just below it. On a smooth surface without clipping, the
+maximum is no more frequent than they are.
 """
 
 from __future__ import annotations
@@ -24,13 +26,15 @@ from splinecli.maths.robust import absolute_weights, fit_scaled_normals, shade, 
 from splinecli.records.capture_warnings import WHITE_LEVEL, CaptureWarning
 from splinecli.records.white_level import WhiteLevel
 
-# From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
-# pixel shows.
+# From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its
+# scaled normal a matte pixel shows.
 LightsOf = Callable[[Integers], Float64Array]
 
 
 def find_saturated(pixels: Array) -> Bools:
-    """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels have none."""
+    """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels
+    have none.
+    """
     if pixels.dtype.kind != "u":
         return np.zeros(len(pixels), np.bool_)
     return in_any_channel(pixels == np.iinfo(pixels.dtype).max)
@@ -41,15 +45,19 @@ def in_any_channel(flags: Bools) -> Bools:
     return np.asarray(reduce(np.logical_or, flags.T))
 
 
-def restore_saturated(observations: Float32Array, saturated: Bools, lights: Float64Array | LightsOf) -> Bools | None:
-    """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
+def restore_saturated(
+    observations: Float32Array, saturated: Bools, lights: Float64Array | LightsOf
+) -> Bools | None:
+    """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or
+    None.
 
-    A saturated observation was at least as bright as stored. Its estimate is the prediction of a robust Lambertian fit
-    to the pixel (least absolute deviations by reweighting) or the stored value, whichever is brighter. The fit is
-    repeated on the restored values, so a saturated observation can only raise it. Without this, a pixel would either
-    lose its brightest observations, or its normal would tilt towards the mean of the lights (figures in
-    docs/measurements.md). Pixels that are saturated under every light stay as they are. The lights are unit directions
-    (F, 3), or see LightsOf.
+    A saturated observation was at least as bright as stored. Its estimate is the prediction of a
+    robust Lambertian fit to the pixel (least absolute deviations by reweighting) or the stored
+    value, whichever is brighter. The fit is repeated on the restored values, so a saturated
+    observation can only raise it. Without this, a pixel would either lose its brightest
+    observations, or its normal would tilt towards the mean of the lights (figures in
+    docs/measurements.md). Pixels that are saturated under every light stay as they are. The lights
+    are unit directions (F, 3), or see LightsOf.
     """
     everywhere = np.asarray(saturated.all(axis=1))
     rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)
@@ -71,7 +79,8 @@ def _restored(stored: Float32Array, saturated: Bools, lights: Float32Array) -> F
         raised = saturated & (residuals > 0)
         # No observation is restored to more than eight times the pixel's brightest stored one.
         values = np.where(raised, np.minimum(predicted, 8.0), lowest)
-        # An observation that the fit meets has a weight of 50; raised ones only matter if the others do not suffice.
+        # An observation that the fit meets has a weight of 50; raised ones only matter if the
+        # others do not suffice.
         weights = lit * np.where(raised, np.float32(0.1), absolute_weights(residuals))
     # Rounding must not make a value darker than stored.
     return np.asarray(np.where(saturated, np.maximum(values * scale, stored), stored))
@@ -102,9 +111,11 @@ _NOTHING = np.empty(0, np.int64)
 class ImageValues(NamedTuple):
     """Values that decide whether observations of one image are saturated."""
 
-    full_scale: int | None  # the largest value that the file can store; None for floating-point images
+    # the largest value that the file can store; None for floating-point images
+    full_scale: int | None
     stated: int | None  # the white level that the file states; None if it states none
-    saturated: Integers  # the pixels at the given white level or above, or at full scale if none is given
+    # the pixels at the given white level or above, or at full scale if none is given
+    saturated: Integers
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
     at_maximum: Integers = _NOTHING  # the pixels with this value
     # the largest values below the maximum, at most COMPARED_VALUES and none below half of it
@@ -114,14 +125,17 @@ class ImageValues(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Saturation:
-    """The white level of some images and their saturated observations, decided from these images alone."""
+    """The white level of some images and their saturated observations, decided from these images
+    alone.
+    """
 
     n_pixels: int  # P, the number of the mask's pixels
     images: tuple[ImageValues, ...]
     given: float | None = None  # the white level that the user gave; None to find it
     # the pixels whose observations are wanted; None for all. The level is decided from all pixels
     rows: Integers | None = None
-    even: bool = False  # whether the images show an even target; a single image of it may be clipped, even completely
+    # whether the images show an even target; a single image of it may be clipped, even completely
+    even: bool = False
 
     @property
     def white_level(self) -> WhiteLevel | None:
@@ -135,7 +149,9 @@ class Saturation:
         if not any(len(pixels) for pixels in saturated):
             return None
         rows = slice(None) if self.rows is None else self.rows
-        flags = np.zeros((self.n_pixels if self.rows is None else len(self.rows), len(saturated)), np.bool_)
+        flags = np.zeros(
+            (self.n_pixels if self.rows is None else len(self.rows), len(saturated)), np.bool_
+        )
         for position, pixels in enumerate(saturated):
             column = np.zeros(self.n_pixels, np.bool_)
             column[pixels] = True
@@ -144,7 +160,8 @@ class Saturation:
 
     @property
     def bits(self) -> int | None:
-        """The bits of a camera whose values look as if they stood in 16-bit files without scaling; None otherwise.
+        """The bits of a camera whose values look as if they stood in 16-bit files without scaling;
+        None otherwise.
 
         Scaled values of fewer bits have common divisors.
         """
@@ -161,7 +178,9 @@ class Saturation:
         return np.array([len(pixels) for pixels in self._decision[1]], np.int64)
 
     def choose_images(self, positions: Sequence[int]) -> Saturation:
-        """Return the white level and the saturated observations that some of the images have by themselves."""
+        """Return the white level and the saturated observations that some of the images have by
+        themselves.
+        """
         return replace(self, images=tuple(self.images[position] for position in positions))
 
     def choose_pixels(self, rows: Integers) -> Saturation:
@@ -178,7 +197,9 @@ class Saturation:
             return None, saturated
         maximum = max(image.maximum for image in self.images)
         if maximum not in (0, _FULL_SCALE_16_BIT) and not any(len(pixels) for pixels in saturated):
-            at_maximum = [image.at_maximum if image.maximum == maximum else _NOTHING for image in self.images]
+            at_maximum = [
+                image.at_maximum if image.maximum == maximum else _NOTHING for image in self.images
+            ]
             stated = self._stated_level(maximum)
             if stated is not None:
                 return WhiteLevel(stated, "file"), at_maximum if maximum >= stated else saturated
@@ -201,14 +222,19 @@ class Saturation:
         fewest_pixels = max(3, 1e-4 * self.n_pixels)
         reaching = [image.at_maximum for image in images if len(image.at_maximum) >= fewest_pixels]
         even_at_bits = self.even and _is_bits(maximum)
-        fewest = 1 if even_at_bits else 2 if _is_bits(maximum) else 3  # images that reach a common maximum
+        # images that reach a common maximum
+        fewest = 1 if even_at_bits else 2 if _is_bits(maximum) else 3
         if len(reaching) < fewest:
             return False
-        # A flat background has one value under all lights. Clipped pixels are bright under some lights only.
+        # A flat background has one value under all lights. Clipped pixels are bright under some
+        # lights only.
         images_at_maximum = np.bincount(np.concatenate(reaching), minlength=self.n_pixels)
         number = int(images_at_maximum[images_at_maximum < max(len(reaching), 2)].sum())
-        # Each image has its largest values, so the largest of all are among them, with all of their counts.
-        below, places = np.unique(np.concatenate([image.below for image in images]), return_inverse=True)
+        # Each image has its largest values, so the largest of all are among them, with all of their
+        # counts.
+        below, places = np.unique(
+            np.concatenate([image.below for image in images]), return_inverse=True
+        )
         if len(below) < COMPARED_VALUES and not even_at_bits:
             return False
         counts = np.zeros(len(below), np.int64)
@@ -216,16 +242,22 @@ class Saturation:
         return number >= 5 * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
-def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
+def look_at(
+    pixels: Array, path: Path, *, given: float | None = None, stated: int | None = None
+) -> ImageValues:
     """Return the values that decide which of an image's pixels (P, C), as stored, are saturated.
 
-    `given` is the white level that the user gave, None to find it; `stated` the one that the file states, 2^bits - 1
-    for a number of bits, None if it states none. Raises InputError if the given one is above the image's full scale.
+    `given` is the white level that the user gave, None to find it; `stated` the one that the file
+    states, 2^bits - 1 for a number of bits, None if it states none. Raises InputError if the given
+    one is above the image's full scale.
     """
     full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
     if given is not None:
         if full_scale is not None and given > full_scale:
-            problem = f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}"
+            problem = (
+                f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at"
+                f" {full_scale}"
+            )
             raise InputError(problem, path=path, hint="Lower the white level, or leave it out")
         return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
     maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
@@ -233,7 +265,9 @@ def look_at(pixels: Array, path: Path, *, given: float | None = None, stated: in
         return ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
     at_maximum = _indices(in_any_channel(pixels == maximum))
     saturated = at_maximum if maximum == full_scale else _NOTHING
-    return ImageValues(full_scale, stated, saturated, maximum, at_maximum, *_largest_values(pixels, maximum))
+    return ImageValues(
+        full_scale, stated, saturated, maximum, at_maximum, *_largest_values(pixels, maximum)
+    )
 
 
 def _indices(flags: Bools) -> Integers:
@@ -241,8 +275,12 @@ def _indices(flags: Bools) -> Integers:
     return np.flatnonzero(flags).astype(np.int32 if len(flags) < 2**31 else np.int64)
 
 
-def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
+def _largest_values(
+    pixels: NDArray[np.uint16], maximum: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the values of an image that are compared with its maximum, in rising order, and their
+    counts.
+    """
     lowest_compared = math.ceil(0.5 * maximum)  # clipping cuts through a continuous range of values
     values = pixels.reshape(-1)
     # Few values are near the maximum. The others are counted only if these are not enough.
@@ -259,28 +297,37 @@ def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[n
 
 def _is_bits(level: int) -> bool:
     """Return whether the level is 2^bits - 1, shifted to fill 16 bits or not, for 8 to 15 bits."""
-    return any(level in ((1 << bits) - 1, ((1 << bits) - 1) << (16 - bits)) for bits in range(8, 16))
+    return any(
+        level in ((1 << bits) - 1, ((1 << bits) - 1) << (16 - bits)) for bits in range(8, 16)
+    )
 
 
 def surrounds_hole(mask: Bools) -> bool:
-    """Return whether a mask (H, W) has the border of the picture, and leaves out a part of its middle."""
+    """Return whether a mask (H, W) has the border of the picture, and leaves out a part of its
+    middle.
+    """
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
     return bool(border.mean() >= 0.95 and 0.05 <= 1 - mask.mean() < 1)
 
 
 def looks_inverted(mask: Bools, brightness: Float32Array) -> bool:
-    """Return whether a mask (H, W) surrounds a hole that is not dark in the picture's brightness (H, W)."""
-    return surrounds_hole(mask) and bool(np.median(brightness[~mask]) > 0.5 * np.median(brightness[mask]))
+    """Return whether a mask (H, W) surrounds a hole that is not dark in the picture's brightness
+    (H, W).
+    """
+    return surrounds_hole(mask) and bool(
+        np.median(brightness[~mask]) > 0.5 * np.median(brightness[mask])
+    )
 
 
 def find_object(brightness: Float32Array) -> Bools:
     """Return the mask (H, W) of an object before a darker background.
 
-    Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube
-    root of brightness, in which dark parts of an object are closer to its bright parts than to the background. The mask
-    is the largest connected area above it, with its holes filled. This fails if the background is as bright as the
-    object. The brightness (H, W) is linear: the mean over all lights. Raises InputError if nearly nothing is brighter
-    than the background, or nearly everything is.
+    Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of
+    lightness, the cube root of brightness, in which dark parts of an object are closer to its
+    bright parts than to the background. The mask is the largest connected area above it, with its
+    holes filled. This fails if the background is as bright as the object. The brightness (H, W) is
+    linear: the mean over all lights. Raises InputError if nearly nothing is brighter than the
+    background, or nearly everything is.
     """
     import cv2
 
@@ -292,10 +339,17 @@ def find_object(brightness: Float32Array) -> Bools:
     _, bright = cv2.threshold(lightness, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(bright, connectivity=4)
     largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA])) if len(statistics) > 1 else 0
-    outline, _ = cv2.findContours((labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline, _ = cv2.findContours(
+        (labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
     mask = cv2.drawContours(np.zeros(brightness.shape, np.uint8), outline, -1, 1, cv2.FILLED) > 0
     share = float(mask.mean())
     if not largest or not 0.005 <= share <= 0.98:
-        problem = f"no mask was found: the area brighter than the background covers {100 * share:.1f} % of the picture"
-        raise InputError(problem, hint="Paint a mask, white on the object, and pass it with --mask FILE")
+        problem = (
+            f"no mask was found: the area brighter than the background covers {100 * share:.1f} %"
+            " of the picture"
+        )
+        raise InputError(
+            problem, hint="Paint a mask, white on the object, and pass it with --mask FILE"
+        )
     return np.asarray(mask)

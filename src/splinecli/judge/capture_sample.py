@@ -1,4 +1,6 @@
-"""The input of the checks: a capture's lights, from files or arguments, and a sample of its pixels."""
+"""The input of the checks: a capture's lights, from files or arguments,
+and a sample of its pixels.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ from splinecli.system.files import equal_files, reading
 
 @dataclass(frozen=True, eq=False)
 class CaptureSample:
-    """F images and their lights, the input of the checks; results that several checks need are computed once."""
+    """F images and their lights, the input of the checks; results that several checks need are
+    computed once.
+    """
 
     names: Sequence[str]
     all_directions: Float64Array  # (N, 3), all lights of the file, in its order
@@ -35,12 +39,16 @@ class CaptureSample:
     sample: Sample  # not divided by estimated intensities, as the closeup
     closeup: Sample
     intensities_measured: bool  # whether the intensities are given
-    intensities: Float64Array | None = None  # (F,), the given ones, by which the observations were divided
-    estimated: Float64Array | None = None  # (F,), the estimated ones, by which the sample was not divided
+    # (F,), the given ones, by which the observations were divided
+    intensities: Float64Array | None = None
+    # (F,), the estimated ones, by which the sample was not divided
+    estimated: Float64Array | None = None
     eight_bit: bool = False  # whether the images have 8 bits
-    lamps: NearLamps | None = None  # all near lamps, over the sample's grid; None if the lights are treated as distant
+    # all near lamps, over the sample's grid; None if the lights are treated as distant
+    lamps: NearLamps | None = None
     has_positions: bool = False  # whether positions of lamps are known
-    found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
+    # whether the lights were found from these images, so that the images cannot contradict them
+    found: bool = False
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
     linear: bool = True  # whether the values of the images are taken as linear
@@ -60,7 +68,9 @@ class CaptureSample:
         truth: Floats | None = None,
         strict: bool = False,
     ) -> CaptureSample:
-        """Return the checks' input for the images with these indices, from the capture's files, sample and closeup."""
+        """Return the checks' input for the images with these indices, from the capture's files,
+        sample and closeup.
+        """
         (sample, closeup), lamps, measured = samples, source.lamps, source.intensities_measured
         images = [source.files.images[index] for index in indices]
         with reading(source.files.folder):
@@ -73,9 +83,15 @@ class CaptureSample:
             sample,
             closeup,
             measured,
-            intensities=gray_intensities(source.light_intensities[list(indices)]) if measured else None,
-            eight_bit=any((source.facts[index].stated_size or ((), 0))[1] == 1 for index in indices),
-            lamps=lamps.over(source, sample.mask, step=sample.step) if lamps is not None and lamps.used else None,
+            intensities=gray_intensities(source.light_intensities[list(indices)])
+            if measured
+            else None,
+            eight_bit=any(
+                (source.facts[index].stated_size or ((), 0))[1] == 1 for index in indices
+            ),
+            lamps=lamps.over(source, sample.mask, step=sample.step)
+            if lamps is not None and lamps.used
+            else None,
             has_positions=lamps is not None,
             found=source.find_lights is not None,
             origin=source.files.light_directions or Path("light_directions"),
@@ -96,8 +112,8 @@ class CaptureSample:
     def observations(self) -> Floats:
         """The sample's observations (p, F) as they would be if near lamps were distant.
 
-        The surface is assumed to be a plane. The part that a matte surface explains is replaced; the rest, such as the
-        residual of lights in a wrong order, is kept.
+        The surface is assumed to be a plane. The part that a matte surface explains is replaced;
+        the rest, such as the residual of lights in a wrong order, is kept.
         """
         if self.lamps is None:
             return self.sample.observations
@@ -105,7 +121,9 @@ class CaptureSample:
         near, attenuation = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
         observations = self.sample.observations / attenuation
         scaled_normals = solve_each(observations, near)
-        return np.asarray(observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals))
+        return np.asarray(
+            observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals)
+        )
 
     @cached_property
     def factors(self) -> Factors | None:
@@ -117,19 +135,25 @@ class CaptureSample:
 
         This keeps unequal lamps from looking like a fault of the directions or the values.
         """
-        intensities = 1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
+        intensities = (
+            1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
+        )
         return replace(self.sample, observations=self.observations / intensities)
 
     @cached_property
     def readings(self) -> Readings:
         """The sample as the files store it, to be read in other ways."""
-        observations = self.observations if self.intensities is None else self.observations * self.intensities
+        observations = (
+            self.observations if self.intensities is None else self.observations * self.intensities
+        )
         sample = replace(self.sample, observations=observations)
         return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that fits the images best, and its probability; None if the readings cannot be compared."""
+        """The other reading that fits the images best, and its probability; None if the readings
+        cannot be compared.
+        """
         kinds: set[Kind] = {"offset", "intensities"}
         if self.linear:
             kinds.add("curve")
@@ -141,53 +165,81 @@ class CaptureSample:
 
     @cached_property
     def light_check(self) -> LightCheck:
-        """The result of comparing the images with their lights, after moving shifted images back."""
+        """The result of comparing the images with their lights,
+        after moving shifted images back.
+        """
         return self._check_of_moved(self.shifts) if self.shifts else self._check_as_given
 
     @cached_property
     def _check_as_given(self) -> LightCheck:
         return check_lights(
-            self.observations, self.sample.mask, self.all_directions, self.indices, self.names, self.factors
+            self.observations,
+            self.sample.mask,
+            self.all_directions,
+            self.indices,
+            self.names,
+            self.factors,
         )
 
     def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
-        known, values = moved_back(replace(self.sample, observations=self.observations), self._on_grid(shifts))
+        known, values = moved_back(
+            replace(self.sample, observations=self.observations), self._on_grid(shifts)
+        )
         mask = np.zeros_like(self.sample.mask)
         mask[self.sample.mask] = known
         factors = find_factors(values[known], intensities_known=self.intensities_measured)
-        return check_lights(values[known], mask, self.all_directions, self.indices, self.names, factors)
+        return check_lights(
+            values[known], mask, self.all_directions, self.indices, self.names, factors
+        )
 
     def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
         step = self.sample.step
-        return {shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts}
+        return {
+            shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts
+        }
 
     @cached_property
     def shifts(self) -> list[ImageShift]:
-        found = find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+        found = find_shifts(self.closeup) or (
+            find_shifts(self.sample) if self.sample.step > 1 else []
+        )
         if self.found:
             return found
         step = self.sample.step
         of_shading = shading_shifts(self.evened, self.directions)
         shifts = {shift.place: shift for shift in found}
-        shifts |= {place: ImageShift(place, step * right, step * down) for place, (right, down) in of_shading.items()}
+        shifts |= {
+            place: ImageShift(place, step * right, step * down)
+            for place, (right, down) in of_shading.items()
+        }
         together = [shifts[place] for place in sorted(shifts)]
-        if not of_shading or self._check_as_given.order is None or self._check_of_moved(together).order is None:
+        if (
+            not of_shading
+            or self._check_as_given.order is None
+            or self._check_of_moved(together).order is None
+        ):
             return together
         return found  # the lights are in another order, so they cannot predict shading
 
     @cached_property
     def shift_error_deg(self) -> float | None:
-        """The median angle by which shifted images change the normals; None if too few pixels are left."""
+        """The median angle by which shifted images change the normals; None if too few pixels are
+        left.
+        """
         if self.found:
             return None
         known, values = moved_back(self.evened, self._on_grid(self.shifts))
         if not known.any():
             return None
-        return median_turn_deg(self.evened.observations[known], self.directions, self.directions, values[known])
+        return median_turn_deg(
+            self.evened.observations[known], self.directions, self.directions, values[known]
+        )
 
 
 def gray_intensities(intensities: Floats) -> Float64Array:
-    """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are divided out."""
+    """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are
+    divided out.
+    """
     values = np.asarray(intensities, np.float64)
     if values.ndim == 2:
         values = 1 / (1 / values).mean(axis=1)

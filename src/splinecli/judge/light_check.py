@@ -1,7 +1,9 @@
-"""Detect light directions in a wrong frame or order, from the images and the normals that they give.
+"""Detect light directions in a wrong frame or order, from the images and the normals that they
+give.
 
-The thresholds were chosen on captures of splinecli's own renderer (MERL's measured materials, CyclesPS's classes of
-materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the figures.
+The thresholds were chosen on captures of splinecli's own renderer (MERL's measured materials,
+CyclesPS's classes of materials, 6 to 48 lights, with and without errors of their directions);
+docs/measurements.md has the figures.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,8 +30,9 @@ from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 
-# The advantage of a frame: the weight of a difference of rims, the smallest difference that distinguishes two frames,
-# and the advantage that any rotation needs, because its angle is fitted. From 1 on, a frame is better.
+# The advantage of a frame: the weight of a difference of rims, the smallest difference that
+# distinguishes two frames, and the advantage that any rotation needs, because its angle is fitted.
+# From 1 on, a frame is better.
 _RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 2.0
 
 
@@ -38,10 +41,14 @@ class Candidate:
     """One reading of the light file."""
 
     name: str  # in words, such as "y negated"
-    frame: LightFrame | None  # its frame, relative to the given one. None for an order that no frame is equivalent to
-    matrix: Float64Array = field(compare=False)  # (3, 3) M, where lights @ M' are the lights in this reading
+    # its frame, relative to the given one. None for an order that no frame is equivalent to
+    frame: LightFrame | None
+    # (3, 3) M, where lights @ M' are the lights in this reading
+    matrix: Float64Array = field(compare=False)
     curl: float  # of the normals; 0 is a surface
-    rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
+    # mean cosine between normals and the outward direction at the outline; NaN without a closed
+    # outline
+    rim: float
     is_order: bool = False  # whether it is another order of the lights
     steps: int = 0  # by how many lights it shifts the order
     advantage: float = 0.0  # evidence for it against the given lights; from 1 it is better
@@ -51,18 +58,27 @@ class Candidate:
 class LightCheck:
     """The result of comparing the light directions with the images."""
 
-    candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
-    order: str | None  # a reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
-    given_misfit: float  # residual in the given order, as a share of random orders'; NaN with too few lights
+    # readings of the light file; the given one first, then from best to worst
+    candidates: tuple[Candidate, ...]
+    # a reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one
+    # fits
+    order: str | None
+    # residual in the given order, as a share of random orders'; NaN with too few lights
+    given_misfit: float
     order_misfit: float  # the same in the better order
-    best: Candidate | None  # the reading that gives better normals, if any. Its frame is relative to the given one
+    # the reading that gives better normals, if any. Its frame is relative to the given one
+    best: Candidate | None
     tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
-    mended: Float64Array | None  # (F, 3), in the best reading; None for the given one, or if none clearly is best
-    error_deg: float | None = None  # median angle by which the given lights change the normals, if `best` is right
+    # (F, 3), in the best reading; None for the given one, or if none clearly is best
+    mended: Float64Array | None
+    # median angle by which the given lights change the normals, if `best` is right
+    error_deg: float | None = None
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
-    lacks_shadows: bool = False  # whether they contradict the given lights, without supporting others
-    odd_image: OddImage | None = None  # an image that contradicts the others, without which all this was found
+    # whether they contradict the given lights, without supporting others
+    lacks_shadows: bool = False
+    # an image that contradicts the others, without which all this was found
+    odd_image: OddImage | None = None
 
     @property
     def given(self) -> Candidate:
@@ -73,13 +89,19 @@ class LightCheck:
         """The properties of the lights that the images leave undetermined, in words."""
         missing = []
         if np.isnan(self.given_misfit):
-            missing.append(f"their order (fewer than {FEWEST_LIGHTS} lights, too few lit pixels, or a flat object)")
+            missing.append(
+                f"their order (fewer than {FEWEST_LIGHTS} lights, too few lit pixels, or a flat"
+                " object)"
+            )
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
         elif not (self.outline_tells or self.shadows_tell):
-            missing.append("whether x and y are both negated (the mask's edge is not a clear outline of the object)")
+            missing.append(
+                "whether x and y are both negated (the mask's edge is not a clear outline of the"
+                " object)"
+            )
         return missing
 
     @property
@@ -96,9 +118,11 @@ def check_lights(
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
 ) -> LightCheck:
-    """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of light_directions (N, 3).
+    """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of
+    light_directions (N, 3).
 
-    `names` are the names of the F images, for the texts of the result, and `factors` is find_factors(observations).
+    `names` are the names of the F images, for the texts of the result, and `factors` is
+    find_factors(observations).
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
@@ -106,7 +130,11 @@ def check_lights(
     check = _check_frame_and_order(observations, mask, light_directions, chosen, names, factors)
     odd = None if factors is None else find_odd_image(factors, light_directions[chosen])
     other_order = check.order not in (None, UNKNOWN_ORDER)
-    if factors is None or odd is None or (other_order and check.order_misfit <= odd.left * check.given_misfit):
+    if (
+        factors is None
+        or odd is None
+        or (other_order and check.order_misfit <= odd.left * check.given_misfit)
+    ):
         return check
     kept = np.delete(np.arange(len(chosen)), odd.place)
     others = observations[:, kept]
@@ -128,15 +156,29 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
-    # The share of steep pixels at the rim below which the mask's edge is not an outline, and from which it fully is.
-    weight = float(np.clip((normals.rim_steepness - 0.3) / (0.6 - 0.3), 0, 1)) if found.plausible else 0.0
+    # The share of steep pixels at the rim below which the mask's edge is not an outline, and from
+    # which it fully is.
+    weight = (
+        float(np.clip((normals.rim_steepness - 0.3) / (0.6 - 0.3), 0, 1))
+        if found.plausible
+        else 0.0
+    )
 
-    def candidate(name: str, frame: LightFrame | None, matrix: Float64Array, **kind: Any) -> Candidate:
+    def candidate(
+        name: str, frame: LightFrame | None, matrix: Float64Array, **kind: Any
+    ) -> Candidate:
         turned = normals.transformed(matrix)
-        return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, **kind)
+        return Candidate(
+            name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, **kind
+        )
 
-    given, *others = (candidate(frame.describe() or "as given", frame, frame.matrix) for frame in PLANE_FRAMES)
-    others += [candidate(turn.words, None, turn.matrix, is_order=True, steps=turn.steps) for turn in found.turns]
+    given, *others = (
+        candidate(frame.describe() or "as given", frame, frame.matrix) for frame in PLANE_FRAMES
+    )
+    others += [
+        candidate(turn.words, None, turn.matrix, is_order=True, steps=turn.steps)
+        for turn in found.turns
+    ]
     others += [candidate(name, None, matrix) for name, matrix in _rotations(normals)]
     judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
     # If no order fits, the normals are not evidence.
@@ -147,7 +189,11 @@ def _check_frame_and_order(
         judged, shadows_tell, lacks_shadows = _by_shadows(judged, given, shadows)
     ranked = sorted(judged, key=lambda other: -other.advantage)
     # Rotations are listed only if they matter.
-    ranked = [each for each in ranked if each.frame is not None or each.is_order or each.advantage >= _ROTATED]
+    ranked = [
+        each
+        for each in ranked
+        if each.frame is not None or each.is_order or each.advantage >= _ROTATED
+    ]
     order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
     if best is not None:
@@ -159,12 +205,16 @@ def _check_frame_and_order(
         rng = np.random.default_rng(0)
         # Normals under these random orders are compared with those under the given one.
         orders = [rng.permutation(lights) for _ in range(3)]
-        turn_deg = float(np.median([median_turn_deg(observations, lights, others) for others in orders]))
+        turn_deg = float(
+            np.median([median_turn_deg(observations, lights, others) for others in orders])
+        )
     elif mended is not None:
         turn_deg = median_turn_deg(observations, lights, mended)
     if order is not None and best is not None and best.is_order:
         order, best = best.name, None  # one of several orders that fit, chosen by the normals
-    check = LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None)
+    check = LightCheck(
+        (given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None
+    )
     tie = best is not None and mirror_twin(check, best) is not None
     clear = not tie and not found.misfit > LARGEST_MENDED
     return replace(
@@ -177,7 +227,9 @@ def _check_frame_and_order(
 
 
 def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
-    """Yield rotations of the lights about the view axis after which the normals have the least curl, in words."""
+    """Yield rotations of the lights about the view axis after which the normals have the least
+    curl, in words.
+    """
     for mirrored in (False, True):
         least_deg = normals.least_curl_deg(mirrored=mirrored)
         # Smaller rotations from the nearest frame are errors of a calibration.
@@ -185,15 +237,21 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
             continue
         for degrees in (least_deg, least_deg - np.copysign(180, least_deg)):
             cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-            matrix = np.array(((cos, -sin, 0), (sin, cos, 0), (0, 0, 1))) @ np.diag((-1.0 if mirrored else 1.0, 1, 1))
+            matrix = np.array(((cos, -sin, 0), (sin, cos, 0), (0, 0, 1))) @ np.diag(
+                (-1.0 if mirrored else 1.0, 1, 1)
+            )
             negated = "x negated and " if mirrored else ""
             yield f"{negated}rotated by {degrees:.0f} degrees about the view axis", matrix
 
 
-def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -> tuple[list[Candidate], bool, bool]:
-    """Return candidates after cast shadows separated the given reading and the best other one from their twins.
+def _by_shadows(
+    judged: list[Candidate], given: Candidate, check: ShadowCheck
+) -> tuple[list[Candidate], bool, bool]:
+    """Return candidates after cast shadows separated the given reading and the best other one from
+    their twins.
 
-    Also return whether shadows exclude the given lights with x and y negated, and whether the given lights lack some.
+    Also return whether shadows exclude the given lights with x and y negated, and whether the given
+    lights lack some.
     """
     shadows, best = check.shadows(given.matrix), max(judged, key=lambda other: other.advantage)
     told = {}
@@ -203,7 +261,9 @@ def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -
             found = shadows if one is given else check.shadows(one.matrix)
             told[twin.name] = found, check.shadows(twin.matrix)
     judged = [
-        replace(other, advantage=other.advantage + told[other.name][0].evidence(told[other.name][1]))
+        replace(
+            other, advantage=other.advantage + told[other.name][0].evidence(told[other.name][1])
+        )
         if other.name in told
         else other
         for other in judged
@@ -214,13 +274,18 @@ def _by_shadows(judged: list[Candidate], given: Candidate, check: ShadowCheck) -
 
 def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:
     matrix = BOTH_NEGATED.matrix @ one.matrix
-    return next((other for other in candidates if np.allclose(other.matrix, matrix, atol=1e-6)), None)
+    return next(
+        (other for other in candidates if np.allclose(other.matrix, matrix, atol=1e-6)), None
+    )
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    # Among near equals, a frame is preferred, or with `in_order` another order, because the order is known to be wrong.
+    # Among near equals, a frame is preferred, or with `in_order` another order, because the order
+    # is known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
-    simple = [candidate for candidate in better if candidate.frame is not None or candidate.is_order]
+    simple = [
+        candidate for candidate in better if candidate.frame is not None or candidate.is_order
+    ]
     if better and better[0].advantage > (simple[0].advantage if simple else 0) + _TOLD_APART:
         better = [candidate for candidate in better if candidate not in simple] or better
     else:
@@ -239,9 +304,15 @@ def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
 
 
 def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
-    """Return the reading with x and y also negated, if the evidence does not distinguish it from the best one."""
+    """Return the reading with x and y also negated, if the evidence does not distinguish it from
+    the best one.
+    """
     twin = _negated(check.candidates, best)
-    return twin if twin not in (None, check.given) and twin.advantage > best.advantage - _TOLD_APART else None
+    return (
+        twin
+        if twin not in (None, check.given) and twin.advantage > best.advantage - _TOLD_APART
+        else None
+    )
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
@@ -249,21 +320,32 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
 
     Frames come first, then orders, which are judged by their residual alone.
     """
-    readings = [(each.name, check.order_misfit, each.curl, each.rim, each.advantage) for each in check.candidates]
+    readings = [
+        (each.name, check.order_misfit, each.curl, each.rim, each.advantage)
+        for each in check.candidates
+    ]
     readings += [(words, misfit, np.nan, np.nan, np.nan) for words, misfit in check.tried]
     names = ("misfit", "curl", "rim", "advantage")
-    rounded = ((words, [round(v, 3) if np.isfinite(v) else None for v in values]) for words, *values in readings)
-    return [{"reading": words, **dict(zip(names, values, strict=True))} for words, values in rounded]
+    rounded = (
+        (words, [round(v, 3) if np.isfinite(v) else None for v in values])
+        for words, *values in readings
+    )
+    return [
+        {"reading": words, **dict(zip(names, values, strict=True))} for words, values in rounded
+    ]
 
 
 _WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
 
 
-def light_warnings(check: LightCheck, light_file: Path, frame: LightFrame, strict: bool) -> list[CaptureWarning]:
-    """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
+def light_warnings(
+    check: LightCheck, light_file: Path, frame: LightFrame, strict: bool
+) -> list[CaptureWarning]:
+    """Return the warnings about lights of a file that was read in a frame, which the advice
+    replaces.
 
-    If `strict`, also warn of properties that the images leave undetermined, which is the case for most reliefs without
-    an outline. Each warning states the error of the normals.
+    If `strict`, also warn of properties that the images leave undetermined, which is the case for
+    most reliefs without an outline. Each warning states the error of the normals.
     """
     warnings = []
     if check.order is not None:
@@ -271,19 +353,27 @@ def light_warnings(check: LightCheck, light_file: Path, frame: LightFrame, stric
         warnings.append(CaptureWarning(kind, _order_text(check, light_file), check.error_deg))
     if check.best is not None:
         kind = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
-        warnings.append(CaptureWarning(kind, _frame_text(check, check.best, frame, light_file), check.error_deg))
+        warnings.append(
+            CaptureWarning(kind, _frame_text(check, check.best, frame, light_file), check.error_deg)
+        )
     if check.lacks_shadows:
         text = (
-            f"Under the lights of {light_file.name}, the surface should cast shadows that are not in the images. With"
-            " x and y of the lights negated, bumps become hollows, and fewer shadows are missing. The images do not"
-            " decide which is right. Compare bumps and hollows with the object. If they are exchanged, run again with"
+            f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
+            " in the images. With"
+            " x and y of the lights negated, bumps become hollows, and fewer shadows are missing."
+            " The images do not"
+            " decide which is right. Compare bumps and hollows with the object. If they are"
+            " exchanged, run again with"
             f" --light-frame {BOTH_NEGATED.after(frame)}."
         )
-        # A bump looks the same as a hollow. With this error, about a quarter of the normals of a good capture are
-        # expected within 5 degrees.
+        # A bump looks the same as a hollow. With this error, about a quarter of the normals of a
+        # good capture are expected within 5 degrees.
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
     if strict and check.unchecked:
-        text = f"The lights of {light_file.name} could not be fully verified. Unchecked: {'; '.join(check.unchecked)}."
+        text = (
+            f"The lights of {light_file.name} could not be fully verified. Unchecked:"
+            f" {'; '.join(check.unchecked)}."
+        )
         warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
     return warnings
 
@@ -303,35 +393,52 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
         remedy = f"Double the angle of each light from the camera axis, as {_WRITES_MENDED} does."
         if check.order_misfit > HALF_LEFT * check.given_misfit:  # a ring, recognised by the albedo
             return (
-                f"{light_file.name} probably contains half vectors, half-way between the lights and the camera axis:"
+                f"{light_file.name} probably contains half vectors, half-way between the lights"
+                " and the camera axis:"
                 f" under them, steep slopes look brighter. {remedy}"
             )
     return (
         f"The images fit the lights of {light_file.name} much better {check.order}"
-        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
+        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %)."
+        f" {remedy}"
     )
 
 
 def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
-    pairs = (("curl", best.curl, check.given.curl, ".2f"), ("outline", best.rim, check.given.rim, "+.2f"))
+    pairs = (
+        ("curl", best.curl, check.given.curl, ".2f"),
+        ("outline", best.rim, check.given.rim, "+.2f"),
+    )
     figures = [
         f"{name} {one:{form}} against {other:{form}}"
         for name, one, other, form in pairs
         if f"{one:{form}}" != f"{other:{form}}"
     ]
     twin = mirror_twin(check, best)
-    names = [each.name if each.frame is None else f"with {each.name}" for each in (best, twin) if each is not None]
+    names = [
+        each.name if each.frame is None else f"with {each.name}"
+        for each in (best, twin)
+        if each is not None
+    ]
     text = f"The lights give normals that fit a surface much better {' or '.join(names)}"
     if figures:
         text += f" ({', '.join(figures)})"
     if best.is_order:
         return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
-    which = "They exchange bumps and hollows; without a closed outline, only the object itself shows which is right."
+    which = (
+        "They exchange bumps and hollows; without a closed outline, only the object itself shows"
+        " which is right."
+    )
     if best.frame is None:
-        return f"{text}. " + (f"Rotate the light directions, as {_WRITES_MENDED} does." if twin is None else which)
+        return f"{text}. " + (
+            f"Rotate the light directions, as {_WRITES_MENDED} does." if twin is None else which
+        )
     advice = f"{text}: run again with --light-frame {best.frame.after(frame)}"
     if twin is not None and twin.frame is not None:
         return f"{advice} or {twin.frame.after(frame)}. {which}"
     if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
-        advice += ". If the object is hollow up to its outline, like the inside of a bowl, the lights are right"
+        advice += (
+            ". If the object is hollow up to its outline, like the inside of a bowl, the lights"
+            " are right"
+        )
     return f"{advice}."

@@ -1,12 +1,13 @@
-"""Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are shifted.
+"""Detect lights in a wrong order, by how well they fit the images; also rings of a dome that are
+shifted.
 
-In a dome, single rings may be shifted or mirrored against the others in the light file, because they begin at another
-lamp or run the other way round.
+In a dome, single rings may be shifted or mirrored against the others in the light file, because
+they begin at another lamp or run the other way round.
 
-Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
-others, as a brighter lamp would. For metals, this distinguishes right lights from wrong ones far better than known
-intensities do. On flat objects, however, free intensities explain any order. Thresholds are chosen as in
-light_check.py.
+Each light may have any intensity, even if intensities are known: highlights brighten some images of
+a metal more than others, as a brighter lamp would. For metals, this distinguishes right lights from
+wrong ones far better than known intensities do. On flat objects, however, free intensities explain
+any order. Thresholds are chosen as in light_check.py.
 """
 
 from collections.abc import Iterator, Sequence
@@ -54,23 +55,33 @@ _WAYS = {
 
 
 def mend_rings(factors: Factors, lights: Float64Array) -> tuple[str, Float64Array, float]:
-    """Return corrections of the rings of lights (F, 3), in words (none if they fit), the new lights and their residual.
+    """Return corrections of the rings of lights (F, 3), in words (none if they fit), the new lights
+    and their residual.
 
-    Rings are corrected one after the other, the best first, as long as the images fit clearly better. The search starts
-    from the given file and, because many wrong rings hide each other, from the readings that each ring alone predicts
-    for all others. The images determine only how the rings are oriented relative to each other; most are assumed to be
-    right.
+    Rings are corrected one after the other, the best first, as long as the images fit clearly
+    better. The search starts from the given file and, because many wrong rings hide each other,
+    from the readings that each ring alone predicts for all others. The images determine only how
+    the rings are oriented relative to each other; most are assumed to be right.
     """
     found = [_Mended(lights, float(factors.misfits(lights[None])[0]), [])]
     for rings in find_rings(lights):
         trials = [list(_readings(lights[ring])) for ring in rings]
-        anchored = [_seen_from(anchor, factors.matrix, rings, trials) for anchor in range(len(rings))]
+        anchored = [
+            _seen_from(anchor, factors.matrix, rings, trials) for anchor in range(len(rings))
+        ]
         starts = [[0] * len(rings), *anchored]
-        found += [_descend(factors, lights, rings, trials, start) for start in dict.fromkeys(map(tuple, starts))]
+        found += [
+            _descend(factors, lights, rings, trials, start)
+            for start in dict.fromkeys(map(tuple, starts))
+        ]
     least = min(each.misfit for each in found)
     near_least = (each for each in found if each.misfit <= least * (1 + _EQUAL) + _EQUAL)
-    best = min(near_least, key=lambda each: (len(each.rings), sum(len(words) for _, words in each.rings)))
-    parts: dict[str, list[str]] = {}  # the lights of rings by their correction: "with lights 9 to 16 shifted by +1"
+    best = min(
+        near_least, key=lambda each: (len(each.rings), sum(len(words) for _, words in each.rings))
+    )
+    parts: dict[
+        str, list[str]
+    ] = {}  # the lights of rings by their correction: "with lights 9 to 16 shifted by +1"
     for lamps, words in best.rings:
         whole = len(lamps) == lamps[-1] - lamps[0] + 1
         numbers = f"{lamps[0] + 1} to {lamps[-1] + 1}" if whole else ", ".join(map(str, lamps + 1))
@@ -88,45 +99,62 @@ class _Mended(NamedTuple):
 _Trials = list[list[tuple[str, Float64Array]]]  # of each ring, its readings; the first as given
 
 
-def _seen_from(anchor: int, matrix: Float64Array, rings: list[Integers], trials: _Trials) -> list[int]:
+def _seen_from(
+    anchor: int, matrix: Float64Array, rings: list[Integers], trials: _Trials
+) -> list[int]:
     """Return the reading of each ring that fits the factors' matrix (3, F) if one ring is right."""
     # One ring determines the 3 x 3 matrix between lights and factors. Intensities are left out.
     to_factors = matrix[:, rings[anchor]] @ np.linalg.pinv(trials[anchor][0][1].T)
     chosen = []
     for ring, readings in zip(rings, trials, strict=True):
         shown = unit(matrix[:, ring].T)
-        distances = np.array([((unit(lights @ to_factors.T) - shown) ** 2).sum() for _, lights in readings])
+        distances = np.array(
+            [((unit(lights @ to_factors.T) - shown) ** 2).sum() for _, lights in readings]
+        )
         # The first ring that is nearly as close as the closest
         chosen.append(int(np.flatnonzero(distances <= distances.min() * (1 + 0.1) + 1e-9)[0]))
     return chosen
 
 
 def _descend(
-    factors: Factors, lights: Float64Array, rings: list[Integers], trials: _Trials, start: Sequence[int]
+    factors: Factors,
+    lights: Float64Array,
+    rings: list[Integers],
+    trials: _Trials,
+    start: Sequence[int],
 ) -> _Mended:
     """Return the best readings of rings from a start, changed one after the other."""
     mended, chosen = lights.copy(), list(start)
     for lamps, readings, reading in zip(rings, trials, chosen, strict=True):
         mended[lamps] = readings[reading][1]
     misfit = float(factors.misfits(mended[None])[0])
-    places = [(ring, reading) for ring, readings in enumerate(trials) for reading in range(len(readings))]
+    places = [
+        (ring, reading) for ring, readings in enumerate(trials) for reading in range(len(readings))
+    ]
     for _ in range(2 * len(rings)):
         stack = np.repeat(mended[None], len(places), axis=0)
         for row, (ring, reading) in enumerate(places):
             stack[row, rings[ring]] = trials[ring][reading][1]
         misfits = factors.misfits(stack)
-        if misfits.min() > 0.95 * misfit:  # one more ring is corrected if at most this share of the residual is left
+        if (
+            misfits.min() > 0.95 * misfit
+        ):  # one more ring is corrected if at most this share of the residual is left
             break
         # On a regular ring, several readings are the same. The first ones are the simplest.
         best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
         ring, chosen[ring] = places[best]
         mended, misfit = stack[best], float(misfits[best])
-    words = [(lamps, readings[reading][0]) for lamps, readings, reading in zip(rings, trials, chosen, strict=True)]
+    words = [
+        (lamps, readings[reading][0])
+        for lamps, readings, reading in zip(rings, trials, chosen, strict=True)
+    ]
     return _Mended(mended, misfit, [(lamps, how) for lamps, how in words if how])
 
 
 def find_rings(lights: Float64Array) -> Iterator[list[Integers]]:
-    """Yield divisions of the lights (F, 3) into rings, as the indices of the lights in each ring with enough lights."""
+    """Yield divisions of the lights (F, 3) into rings, as the indices of the lights in each ring
+    with enough lights.
+    """
     elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
     order = elevation.argsort(kind="stable")
     # Lights belong to one ring if their elevations follow each other at smaller steps.
@@ -138,9 +166,11 @@ def find_rings(lights: Float64Array) -> Iterator[list[Integers]]:
 
 
 def _rounds(lights: Float64Array) -> list[Integers]:
-    """Return the indices of the lights (F, 3) of each ring, where the azimuth goes once round each ring in the file.
+    """Return the indices of the lights (F, 3) of each ring, where the azimuth goes once round each
+    ring in the file.
 
-    This separates rings at nearly the same elevation. The list is empty if the azimuth does anything else.
+    This separates rings at nearly the same elevation. The list is empty if the azimuth does
+    anything else.
     """
     steps = np.diff(np.arctan2(lights[:, 1], lights[:, 0]), append=0)
     steps = (steps + np.pi) % (2 * np.pi) - np.pi
@@ -166,7 +196,9 @@ def _readings(given: Float64Array) -> Iterator[tuple[str, Float64Array]]:
 
 
 class Turn(NamedTuple):
-    """A shift of the lights that fits as well: in words, its steps, and the matrix (3, 3) that takes lights there."""
+    """A shift of the lights that fits as well: in words, its steps, and the matrix (3, 3) that
+    takes lights there.
+    """
 
     words: str
     steps: int
@@ -177,18 +209,24 @@ class Turn(NamedTuple):
 class LightOrder:
     """The order of lights that fits best."""
 
-    order: str | None  # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
+    # in words; None for the given order, UNKNOWN_ORDER where neither it nor another one fits
+    order: str | None
     lights: Float64Array  # (F, 3), in this order
-    intensities: Float64Array  # (F,), of metals: those that fit best; ones if only known ones determine the order
+    # (F,), of metals: those that fit best; ones if only known ones determine the order
+    intensities: Float64Array
     given_misfit: float = np.nan  # as a share of random orders'; NaN with too few lights
     misfit: float = np.nan  # the same for this order
     plausible: bool = True  # whether the lights fit well enough for the normals to show an outline
-    tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its residual as a share of random orders'
+    tried: tuple[
+        tuple[str, float], ...
+    ] = ()  # readings in words, each with its residual as a share of random orders'
     turns: tuple[Turn, ...] = ()  # shifts that fit as well. They rotate a regular ring of lights
 
 
 class _Reading(NamedTuple):
-    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their residual."""
+    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their
+    residual.
+    """
 
     words: str | None
     lights: Float64Array
@@ -202,9 +240,11 @@ def check_order(
     chosen: Integers,
     names: Sequence[str],
 ) -> LightOrder:
-    """Return the order of the `chosen` lights (F,) of light_directions (N, 3) that fits observations (P, F) best.
+    """Return the order of the `chosen` lights (F,) of light_directions (N, 3) that fits
+    observations (P, F) best.
 
-    `factors` is find_factors(observations), None if too few are lit. All lights are shifted and reversed together.
+    `factors` is find_factors(observations), None if too few are lit. All lights are shifted and
+    reversed together.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))
@@ -223,7 +263,10 @@ def check_order(
     misfits = compared.misfits(shifted)
     rows = 1 + int(misfits[1:n_all].argmin()), n_all + int(misfits[n_all:].argmin())
     shifts = [_Reading(_shift_words(row, n_all), shifted[row], float(misfits[row])) for row in rows]
-    exchanged, of_angles = _best_exchange(compared, lights, names), reading(ZENITH, zenith_as_elevation(lights))
+    exchanged, of_angles = (
+        _best_exchange(compared, lights, names),
+        reading(ZENITH, zenith_as_elevation(lights)),
+    )
     tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
     doubled = lights_of_half_vectors(lights)
     # Half vectors of lights above the horizon are within 45 degrees of the axis.
@@ -232,13 +275,19 @@ def check_order(
     # A better order leaves at most this share of the given residual, which is less for few lights.
     limit = min(given.misfit * (0.4 if len(lights) <= 8 else 0.6), LARGEST_MENDED * usual)
     best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
-    if tried[-1].words == HALF_VECTORS and _are_half_vectors(observations, factors, lights, doubled):
+    if tried[-1].words == HALF_VECTORS and _are_half_vectors(
+        observations, factors, lights, doubled
+    ):
         found = tried[-1]
     elif share > 0.25 and best.misfit < limit:  # a wrong order has a larger residual
         found = best
     elif share > 0.08 and exchanged.misfit < limit:  # where two lights are exchanged
         found = exchanged
-    if found.words != HALF_VECTORS and found.misfit > 0.1 * usual and np.array_equal(chosen, np.arange(n_all)):
+    if (
+        found.words != HALF_VECTORS
+        and found.misfit > 0.1 * usual
+        and np.array_equal(chosen, np.arange(n_all))
+    ):
         rings = _Reading(*mend_rings(compared, lights))
         if rings.words:
             tried.append(rings)
@@ -263,7 +312,9 @@ def check_order(
     )
 
 
-def _are_half_vectors(observations: Floats, factors: Factors, lights: Float64Array, doubled: Float64Array) -> bool:
+def _are_half_vectors(
+    observations: Floats, factors: Factors, lights: Float64Array, doubled: Float64Array
+) -> bool:
     """Return whether the lights (F, 3) with doubled angles from the axis fit clearly better."""
     better = False
     for known in (True, False):
@@ -276,8 +327,12 @@ def _are_half_vectors(observations: Floats, factors: Factors, lights: Float64Arr
     return better or _brighten_as_half_vectors(observations, lights, doubled)
 
 
-def _brighten_as_half_vectors(observations: Floats, lights: Float64Array, doubled: Float64Array) -> bool:
-    """Return whether the albedo under lights (F, 3) changes with the slope as it does under half vectors."""
+def _brighten_as_half_vectors(
+    observations: Floats, lights: Float64Array, doubled: Float64Array
+) -> bool:
+    """Return whether the albedo under lights (F, 3) changes with the slope as it does under half
+    vectors.
+    """
     chosen, values = lit_values(observations, LIT_SHARE, _FITTED_PIXELS)
     lit = shadow_weights(values)
     scaled = [fit_robustly(values, lit, reading, _FITS)[0] for reading in (lights, doubled)]
@@ -288,10 +343,11 @@ def _brighten_as_half_vectors(observations: Floats, lights: Float64Array, double
     for _ in range(_FITS):
         solution = np.linalg.lstsq(weights[:, None] * terms, weights * albedo, rcond=None)[0]
         weights = np.sqrt(absolute_weights(albedo - terms @ solution))
-    # A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this share of the
-    # expected change of the albedo, lights are half vectors, if the logarithm of that change has at least this
-    # standard deviation. Synthetic objects, matte or glossy, plain or textured, have 0.4 to 1.3 with half vectors,
-    # below 0.4 with right lights and below 0.5 with near lamps.
+    # A single ring fits as well at any elevation, but half vectors brighten steep slopes. From this
+    # share of the expected change of the albedo, lights are half vectors, if the logarithm of that
+    # change has at least this standard deviation. Synthetic objects, matte or glossy, plain or
+    # textured, have 0.4 to 1.3 with half vectors, below 0.4 with right lights and below 0.5 with
+    # near lamps.
     return bool(solution[1] > 0.65 and change.std() > 0.1)
 
 
@@ -300,20 +356,28 @@ def _best_exchange(factors: Factors, lights: Float64Array, names: Sequence[str])
     misfits = factors.misfits(lights[swaps])
     best = int(misfits.argmin())
     one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
-    return _Reading(f"with the lights of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
+    return _Reading(
+        f"with the lights of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best])
+    )
 
 
-def _is_wrong(observations: Floats, factors: Factors, given: _Reading, random: Float64Array) -> bool:
+def _is_wrong(
+    observations: Floats, factors: Factors, given: _Reading, random: Float64Array
+) -> bool:
     """Return whether lights fit no better than in random orders, whose residuals are given."""
     n_lights = len(given.lights)
     # An order is wrong if more than this share of random orders fits as well.
     by_chance = n_lights >= _FOR_CHANCE and (random <= given.misfit).mean() > 0.02
-    # An order is also wrong above this residual, as a share of random orders', if it is also this many times the
-    # residual that remains under any lights, from highlights and shadows.
+    # An order is also wrong above this residual, as a share of random orders', if it is also this
+    # many times the residual that remains under any lights, from highlights and shadows.
     unfit = given.misfit > 0.5 * np.median(random) and given.misfit > 6.0 * factors.residual
     # With larger residuals of the factors, and few lights, metals fit like a random order.
     judged = factors.residual < 0.2 or n_lights >= 12
-    return judged and bool(by_chance or unfit) and _fits_like_random(observations, factors, given.lights)
+    return (
+        judged
+        and bool(by_chance or unfit)
+        and _fits_like_random(observations, factors, given.lights)
+    )
 
 
 def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
@@ -326,7 +390,9 @@ def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
 
 
 def _free_if_possible(factors: Factors, lights: Float64Array) -> tuple[Factors, Float64Array]:
-    """Return factors to compare with lights of free intensities, if these determine orders, and random residuals."""
+    """Return factors to compare with lights of free intensities, if these determine orders, and
+    random residuals.
+    """
     free = factors.with_free_intensities()
     random = random_misfits(free, lights)
     few = factors.intensities_known and len(lights) < _FOR_CHANCE
@@ -344,12 +410,15 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Float64Arr
     orders = np.stack((lights, *(rng.permutation(lights) for _ in range(9))))
     intensities = factors.intensities(orders)
     given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
-    # Lights whose residual is below this share of the residual in random orders are not reported as wrong.
+    # Lights whose residual is below this share of the residual in random orders are not reported as
+    # wrong.
     return given > 0.7 * float(np.median(random))
 
 
 def _turns(lights: Float64Array, shifted: Float64Array, fitting: Bools) -> tuple[Turn, ...]:
-    """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights (F, 3) in place."""
+    """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights
+    (F, 3) in place.
+    """
     inverse, n_all = np.linalg.pinv(lights), len(shifted) // 2
     turns = []
     for row in np.flatnonzero(fitting).tolist():

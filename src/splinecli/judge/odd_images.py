@@ -1,13 +1,16 @@
-"""Images that contradict the others, or are shifted because the camera moved, and a ground truth that does not fit.
+"""Images that contradict the others, or are shifted because the camera moved, and a ground truth
+that does not fit.
 
-One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow fell on it. Each
-image is left out in turn. If the residual nearly vanishes without one image, and remains without any other, this one is
-odd. So is an image that the factors of rank 3 explain far less well than all others. Thresholds are chosen as in
-light_check.py, after one image was dimmed, exchanged or half in shadow, or one light was moved by 40 degrees.
+One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow
+fell on it. Each image is left out in turn. If the residual nearly vanishes without one image, and
+remains without any other, this one is odd. So is an image that the factors of rank 3 explain far
+less well than all others. Thresholds are chosen as in light_check.py, after one image was dimmed,
+exchanged or half in shadow, or one light was moved by 40 degrees.
 
-Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see light_fit). So each image
-can be predicted from the others under any light, and its fine detail is where the prediction has it. If it is
-elsewhere, the image is shifted: the peak of the normalised cross-correlation gives the distance.
+Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see
+light_fit). So each image can be predicted from the others under any light, and its fine detail is
+where the prediction has it. If it is elsewhere, the image is shifted: the peak of the normalised
+cross-correlation gives the distance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,8 +34,10 @@ class OddImage:
     """An image that contradicts the others."""
 
     place: int
-    left: float  # residual of the lights or the factors without it, as a share of the residual of all images
-    # as a share of the predicted brightness; None if it is not the fault, or the light's intensity is unknown
+    # residual of the lights or the factors without it, as a share of the residual of all images
+    left: float
+    # as a share of the predicted brightness; None if it is not the fault, or the light's intensity
+    # is unknown
     brightness: float | None = None
 
 
@@ -44,22 +49,28 @@ def find_odd_image(factors: Factors, light_directions: Float64Array) -> OddImage
     for compared in (*kinds, factors.with_free_intensities()):
         shares = _shares_left(compared, light_directions)
         first, second = np.argsort(shares)[:2]
-        # Largest residual without the odd image, and smallest one without any other, as shares of all images' residual.
+        # Largest residual without the odd image, and smallest one without any other, as shares of
+        # all images' residual.
         alone = shares[first] < 0.35 and shares[second] > 0.75
-        if alone and factors.residual < 0.2:  # with more, as on metals, residuals of lights are not conclusive
+        if (
+            alone and factors.residual < 0.2
+        ):  # with more, as on metals, residuals of lights are not conclusive
             brightness = _brightness(compared, light_directions, int(first))
             return OddImage(int(first), float(shares[first]), brightness)
     residuals = factors.image_residuals / np.maximum(np.linalg.norm(factors.matrix, axis=0), 1e-12)
     second, first = np.argsort(residuals)[-2:]
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
-    # An odd image's residual is above the first, as a share of its brightness, and this many times any other's.
+    # An odd image's residual is above the first, as a share of its brightness, and this many times
+    # any other's.
     if residuals[first] > max(0.25, 2.5 * residuals[second]) and left < 0.15:
         return OddImage(int(first), left / factors.residual)
     return None
 
 
 def _shares_left(factors: Factors, light_directions: Float64Array) -> Float64Array:
-    """Return the root mean square residuals (F,) without each image, as shares of all images' residual."""
+    """Return the root mean square residuals (F,) without each image, as shares of all images'
+    residual.
+    """
     n_lights = len(light_directions)
     misfit = factors.misfits(light_directions[None])[0]
     if misfit < 0.04:  # of lights, one of whose images is odd, as a share of the brightness
@@ -72,15 +83,20 @@ def _shares_left(factors: Factors, light_directions: Float64Array) -> Float64Arr
 
 
 def _brightness(factors: Factors, light_directions: Float64Array, place: int) -> float | None:
-    """Return the brightness of an image as a share of the others' prediction; None if it is not only scaled."""
+    """Return the brightness of an image as a share of the others' prediction; None if it is not
+    only scaled.
+    """
     if not factors.intensities_known:
         return None
     others = np.delete(np.arange(len(light_directions)), place)
     fit = np.linalg.lstsq(light_directions[others], factors.matrix[:, others].T, rcond=None)[0]
     predicted, found = light_directions[place] @ fit, factors.matrix[:, place]
     brightness = float(found @ predicted / max(predicted @ predicted, 1e-12))
-    misfit = np.linalg.norm(found - brightness * predicted) / max(float(np.linalg.norm(found)), 1e-12)
-    # Largest residual, as a share of an odd image, at which it is considered the same image at another brightness.
+    misfit = np.linalg.norm(found - brightness * predicted) / max(
+        float(np.linalg.norm(found)), 1e-12
+    )
+    # Largest residual, as a share of an odd image, at which it is considered the same image at
+    # another brightness.
     return brightness if brightness > 0 and misfit < 0.3 else None
 
 
@@ -88,7 +104,9 @@ _LARGEST_SHIFT = 8  # the largest shift that is looked for, in pixels of the sam
 
 
 class ImageShift(NamedTuple):
-    """An image whose detail is `right` pixels to the right of, and `down` pixels below, its place in the others."""
+    """An image whose detail is `right` pixels to the right of, and `down` pixels below, its place
+    in the others.
+    """
 
     place: int
     right: int
@@ -97,17 +115,23 @@ class ImageShift(NamedTuple):
     def __str__(self) -> str:
         """Return the shift as "2 right 1 up"."""
         directions = [(self.right, "right", "left"), (self.down, "down", "up")]
-        return " ".join(f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by)
+        return " ".join(
+            f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by
+        )
 
 
 def find_shifts(sample: Sample) -> list[ImageShift]:
-    """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
+    """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of
+    the images.
+    """
     import cv2
 
     values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
     # 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere
     around = np.ones((2 * _LARGEST_SHIFT + 1, 2 * _LARGEST_SHIFT + 1), np.uint8)
-    eroded = cv2.erode(sample.mask.astype(np.float32), around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    eroded = cv2.erode(
+        sample.mask.astype(np.float32), around, borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
     inner = np.asarray(eroded, np.float32)
     # From fewer images, polished metals are predicted so badly that right images are named.
     if values.shape[1] < 10 or np.count_nonzero(inner) < 1000:
@@ -116,8 +140,15 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
 
     def shifts_against(predictors: Sequence[int]) -> list[ImageShift]:
         predicted = enumerate(_predictions(values, predictors))
-        shifts = ((place, _shift(values[:, place], image, sample.mask, inner)) for place, image in predicted)
-        return [ImageShift(place, *(sample.step * by for by in shift)) for place, shift in shifts if shift is not None]
+        shifts = (
+            (place, _shift(values[:, place], image, sample.mask, inner))
+            for place, image in predicted
+        )
+        return [
+            ImageShift(place, *(sample.step * by for by in shift))
+            for place, shift in shifts
+            if shift is not None
+        ]
 
     found = shifts_against(range(values.shape[1]))
     still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
@@ -126,7 +157,9 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
 
 
 def _predictions(values: Float32Array, predictors: Sequence[int]) -> Iterator[Float32Array]:
-    """Yield the prediction (P,) of each image of (P, F) by the three strongest factors of the predictors."""
+    """Yield the prediction (P,) of each image of (P, F) by the three strongest factors of the
+    predictors.
+    """
     products = values.T @ values
     for place in range(len(products)):
         others = [other for other in predictors if other != place]  # no image predicts itself
@@ -137,23 +170,33 @@ def _predictions(values: Float32Array, predictors: Sequence[int]) -> Iterator[Fl
         yield np.asarray(factors @ (factors.T @ values[:, place]), np.float32)
 
 
-def _shift(image: Float32Array, predicted: Float32Array, mask: Bools, inner: Float32Array) -> tuple[int, int] | None:
-    """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images agrees; or None."""
+def _shift(
+    image: Float32Array, predicted: Float32Array, mask: Bools, inner: Float32Array
+) -> tuple[int, int] | None:
+    """Return the shift (right, down) in pixels of the mask's grid at which the detail of two images
+    agrees; or None.
+    """
     detail, expected = _detail(image, mask), _detail(predicted, mask)
     correlations = _correlations(detail, expected, inner)
     right, down = _peak(correlations)
-    peak, unmoved = correlations[_LARGEST_SHIFT + down, _LARGEST_SHIFT + right], correlations[(_LARGEST_SHIFT,) * 2]
+    peak, unmoved = (
+        correlations[_LARGEST_SHIFT + down, _LARGEST_SHIFT + right],
+        correlations[(_LARGEST_SHIFT,) * 2],
+    )
     at_edge = max(abs(right), abs(down)) == _LARGEST_SHIFT  # the peak may be beyond
-    # A shift is accepted if detail correlates so well at it, and so much better than without it. In captures without
-    # shifts, of ten images and more, a polished metal reached 0.44 and 0.17.
+    # A shift is accepted if detail correlates so well at it, and so much better than without it. In
+    # captures without shifts, of ten images and more, a polished metal reached 0.44 and 0.17.
     if at_edge or peak < 0.2 or peak - unmoved < 0.2:
         return None
     around = correlations[_LARGEST_SHIFT + down - 1 :, _LARGEST_SHIFT + right - 1 :][:3, :3]
     # The shortest shift that is accepted, in pixels of the sample. A tripod sinks by half a pixel.
     if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
         return None
-    # A moved camera shifts the whole picture. The highlights of a polished relief move in different directions.
-    for places, middle in zip(np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True):
+    # A moved camera shifts the whole picture. The highlights of a polished relief move in different
+    # directions.
+    for places, middle in zip(
+        np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True
+    ):
         for half in (inner * (places <= middle), inner * (places > middle)):
             of_half = _peak(_correlations(detail, expected, half))
             if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
@@ -161,8 +204,12 @@ def _shift(image: Float32Array, predicted: Float32Array, mask: Bools, inner: Flo
     return right, down
 
 
-def _correlations(detail: Float32Array, expected: Float32Array, inner: Float32Array) -> Float32Array:
-    """Return the correlations of two images (H, W) at shifts down and right up to _LARGEST_SHIFT."""
+def _correlations(
+    detail: Float32Array, expected: Float32Array, inner: Float32Array
+) -> Float32Array:
+    """Return the correlations of two images (H, W) at shifts down and right up to
+    _LARGEST_SHIFT.
+    """
     import cv2
 
     most = slice(_LARGEST_SHIFT, -_LARGEST_SHIFT)
@@ -177,19 +224,25 @@ def _peak(correlations: Float32Array) -> tuple[int, int]:
 
 
 def _top(before: float, middle: float, after: float) -> float:
-    """Return the position of the peak of the parabola through three values, relative to the middle, largest one."""
+    """Return the position of the peak of the parabola through three values, relative to the middle,
+    largest one.
+    """
     return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
 
 
 def _detail(values: Float32Array, mask: Bools) -> Float32Array:
-    """Return values (P,) without their blur, over the local contrast, on a map (H, W); zero outside the mask."""
+    """Return values (P,) without their blur, over the local contrast, on a map (H, W); zero outside
+    the mask.
+    """
     import cv2
 
     inside = mask.astype(np.float32)
 
     def blur(array: Float32Array, deviation: float) -> Float32Array:
         weight = cv2.GaussianBlur(inside, (0, 0), deviation)
-        return np.asarray(cv2.GaussianBlur(array, (0, 0), deviation) / np.maximum(weight, 1e-3), np.float32)
+        return np.asarray(
+            cv2.GaussianBlur(array, (0, 0), deviation) / np.maximum(weight, 1e-3), np.float32
+        )
 
     image = np.zeros(mask.shape, np.float32)
     image[mask] = values
@@ -201,11 +254,16 @@ def _detail(values: Float32Array, mask: Bools) -> Float32Array:
     return np.asarray(detail.clip(-4.0, 4.0), np.float32)  # limits the weight of highlights
 
 
-_FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
+_FRAMES = [
+    LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES
+]
 
 
-def check_ground_truth(sample: Sample, light_directions: Float64Array, truth: Floats | None) -> list[CaptureWarning]:
-    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another frame, or when moved.
+def check_ground_truth(
+    sample: Sample, light_directions: Float64Array, truth: Floats | None
+) -> list[CaptureWarning]:
+    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another
+    frame, or when moved.
 
     It covers the whole images: unit normals, or zero without ground truth. None gives no warning.
     """
@@ -216,18 +274,26 @@ def check_ground_truth(sample: Sample, light_directions: Float64Array, truth: Fl
     if not known.any():
         return []
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals
-    angles = [float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T))) for frame in _FRAMES]
+    angles = [
+        float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T)))
+        for frame in _FRAMES
+    ]
     best = int(np.argmin(angles))
     # Metals reach 30 degrees in the right frame; another frame leaves at most half of the angle.
     if angles[0] <= 20.0 or angles[best] > 0.5 * angles[0]:
         return _shifted(normals, truth, sample)
     frame = _FRAMES[best]
-    kind, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
+    kind, lights = (
+        codes.GROUND_TRUTH_FRAME,
+        ", or the light directions are in another frame than it",
+    )
     if frame.signs[2] < 0:
         kind, lights = codes.GROUND_TRUTH_Z, ""
     text = (
-        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
-        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
+        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but"
+        f" {angles[best]:.0f} degrees"
+        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean"
+        " nothing."
     )
     # Either the ground truth or the normals are wrong by this angle.
     return [CaptureWarning(kind, text, angles[0] if kind == codes.GROUND_TRUTH_FRAME else None)]
@@ -241,7 +307,9 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     right, down, step = 0, 0, max(1, reach // 4)
     angles: dict[tuple[int, int], tuple[float, float]] = {}
     while step:
-        around = range(-reach, reach + 1, step) if not angles else range(-step * 2, step * 2 + 1, step)
+        around = (
+            range(-reach, reach + 1, step) if not angles else range(-step * 2, step * 2 + 1, step)
+        )
         middle = right, down
         for by_right in around:
             for by_down in around:
@@ -258,30 +326,48 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     # The median angle after the best rotation (Kabsch 1976)
     left, _, right_vectors = np.linalg.svd(normals[known].T @ truth[known])
     rotation = left @ np.diag((1, 1, np.sign(np.linalg.det(left @ right_vectors)))) @ right_vectors
-    if after > most_left * float(np.median(angle_between_deg(normals[known], truth[known] @ rotation.T))):
+    if after > most_left * float(
+        np.median(angle_between_deg(normals[known], truth[known] @ rotation.T))
+    ):
         return []
     directions = ((right, "right", "left"), (down, "down", "up"))
     named = " and ".join(
-        f"{abs(by) * sample.step} pixels {more if by > 0 else less}" for by, more, less in directions if by
+        f"{abs(by) * sample.step} pixels {more if by > 0 else less}"
+        for by, more, less in directions
+        if by
     )
     text = (
-        f"The ground truth is {before:.1f} degrees from normals that fit the images, but {after:.1f} degrees once"
-        f" a shift of {named} is undone: it is probably shifted against the images, so the errors mean nothing."
+        f"The ground truth is {before:.1f} degrees from normals that fit the images, but"
+        f" {after:.1f} degrees once"
+        f" a shift of {named} is undone: it is probably shifted against the images, so the errors"
+        " mean nothing."
     )
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 
 
-def _angles_deg(normals: Float64Array, truth: Floats, shift: tuple[int, int]) -> tuple[float, float]:
-    """Return the median angles in degrees between normals and a truth that is moved back, and not moved."""
+def _angles_deg(
+    normals: Float64Array, truth: Floats, shift: tuple[int, int]
+) -> tuple[float, float]:
+    """Return the median angles in degrees between normals and a truth that is moved back, and not
+    moved.
+    """
     height, width = normals.shape[:2]
     right, down = shift
     here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
-    there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
+    there = (
+        slice(max(0, down), height - max(0, -down)),
+        slice(max(0, right), width - max(0, -right)),
+    )
     moved = truth[there]
-    known: Bools = np.all([each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0)
+    known: Bools = np.all(
+        [each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0
+    )
     if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
         return 180.0, 0.0
     every = slice(None, None, -(-int(np.count_nonzero(known)) // 4000))  # to save time
     own = normals[here][known][every]
-    after, before = (float(np.median(angle_between_deg(own, other[known][every]))) for other in (moved, truth[here]))
+    after, before = (
+        float(np.median(angle_between_deg(own, other[known][every])))
+        for other in (moved, truth[here])
+    )
     return after, before

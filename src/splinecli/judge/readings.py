@@ -1,13 +1,15 @@
-"""Other readings of the images: encoded values, near lamps, unequal intensities, and light that every image has.
+"""Other readings of the images: encoded values, near lamps, unequal intensities, and light that
+every image has.
 
-Any one of them can be mistaken for another, so all are fitted to the same pixels and compared together. A matte model
-is fitted under each reading, and its residual is computed in stored values. The probability of a reading is
+Any one of them can be mistaken for another, so all are fitted to the same pixels and compared
+together. A matte model is fitted under each reading, and its residual is computed in stored values.
+The probability of a reading is
 
     p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
 
-where the cost c penalises a reading for its additional freedom and for being rare, and k is the weight of the
-residuals, since no real material is matte. Both were fitted to captures of all classes of materials with and without
-these faults (benchmarks/capture_faults.py --fit).
+where the cost c penalises a reading for its additional freedom and for being rare, and k is the
+weight of the residuals, since no real material is matte. Both were fitted to captures of all
+classes of materials with and without these faults (benchmarks/capture_faults.py --fit).
 """
 
 from collections.abc import Collection, Mapping
@@ -40,7 +42,8 @@ class Reading:
     """A reading of the images, and how well it fits."""
 
     kind: Kind
-    amount: float  # exponent, distance in widths of the object, or constant light; 1 for intensities
+    # exponent, distance in widths of the object, or constant light; 1 for intensities
+    amount: float
     ratio: float  # residual over the given reading's, on the same observations
     evidence: float  # logarithm of its probability over the given reading's
     normals: Float64Array  # (p, 3), scaled, at the chosen pixels
@@ -63,14 +66,20 @@ class _Fit:
 
 
 class Readings:
-    """The pixels of a sample, whose observations are as stored, and the readings that were fitted to them.
+    """The pixels of a sample, whose observations are as stored, and the readings that were fitted
+    to them.
 
-    `lights` are (F, 3), unit; `intensities` (F,) were measured, or are None for equal ones. `eight_bit` is
-    whether the images have 8 bits and do not state that they are linear.
+    `lights` are (F, 3), unit; `intensities` (F,) were measured, or are None for equal ones.
+    `eight_bit` is whether the images have 8 bits and do not state that they are linear.
     """
 
     def __init__(
-        self, sample: Sample, lights: Float64Array, intensities: Float64Array | None = None, *, eight_bit: bool = False
+        self,
+        sample: Sample,
+        lights: Float64Array,
+        intensities: Float64Array | None = None,
+        *,
+        eight_bit: bool = False,
     ) -> None:
         n_lights = len(lights)
         # Pixels below this share of the brightest hundredth are background.
@@ -93,7 +102,9 @@ class Readings:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
         if not self.are_enough:
             return []
-        kinds = [kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]]
+        kinds = [
+            kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]
+        ]
         vectors = self._with(self.lights)
         given, found = _fit(self.values, vectors), list[Reading]()
         if "offset" in kinds:
@@ -109,14 +120,22 @@ class Readings:
             found.append(unequal)
             if "curve" in kinds:  # unequal lamps may hide a curve
                 curve = self._best_curve(free=True)
-                # The intensities under the curve matter, not the intensities that a linear reading needs.
-                of_lamps = unequal.evidence + _cost_of_equal(free.intensities) - _cost_of_equal(curve.intensities)
+                # The intensities under the curve matter, not the intensities that a linear reading
+                # needs.
+                of_lamps = (
+                    unequal.evidence
+                    + _cost_of_equal(free.intensities)
+                    - _cost_of_equal(curve.intensities)
+                )
                 evidence = curve.evidence + of_lamps
                 found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
         return found
 
-    def likeliest(self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()) -> Doubt | None:
-        """Return the reading of these kinds that fits best, and how likely it is; None if they cannot be compared.
+    def likeliest(
+        self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()
+    ) -> Doubt | None:
+        """Return the reading of these kinds that fits best, and how likely it is; None if they
+        cannot be compared.
 
         Kinds that are `accepted` are part of the given reading.
         """
@@ -125,14 +144,19 @@ class Readings:
             return None
         evidence = np.array([reading.evidence for reading in found])
         probabilities = np.exp(evidence - np.logaddexp.reduce([0.0, *evidence]))
-        shares = dict.fromkeys((reading.kind for reading in found if reading.kind not in accepted), 0.0)
+        shares = dict.fromkeys(
+            (reading.kind for reading in found if reading.kind not in accepted), 0.0
+        )
         for reading, probability in zip(found, probabilities, strict=True):
             if reading.kind in shares:
                 shares[reading.kind] += float(probability)
         ranked = sorted(shares, key=lambda kind: -shares[kind])
         if not ranked:
             return None
-        best = max((reading for reading in found if reading.kind == ranked[0]), key=lambda reading: reading.evidence)
+        best = max(
+            (reading for reading in found if reading.kind == ranked[0]),
+            key=lambda reading: reading.evidence,
+        )
         # Readings that are this likely, compared with the likeliest one, are named beside it.
         others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
         return Doubt(best, sum(shares.values()), tuple(others))
@@ -149,16 +173,25 @@ class Readings:
     def _best_curve(self, *, free: bool = False) -> Reading:
         vectors, shadow = self._with(self.lights), 0.35  # encoded shadows are brighter
         given = _fit(self.values, vectors, free=free, shadow=shadow)
-        fits = {gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow) for gamma in _EXPONENTS}
+        fits = {
+            gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow)
+            for gamma in _EXPONENTS
+        }
         return _best("curve", fits, given, -0.8 if self.eight_bit else 0.0)
 
     def _best_near(self, given: _Fit) -> Reading:
-        """Return the best distance. Intensities are free: near lamps look unequal, and unequal lamps may be near."""
-        fits = {widths: _fit(self.values, self._with(self._near(widths)), free=True) for widths in _WIDTHS}
+        """Return the best distance. Intensities are free: near lamps look unequal, and unequal
+        lamps may be near.
+        """
+        fits = {
+            widths: _fit(self.values, self._with(self._near(widths)), free=True)
+            for widths in _WIDTHS
+        }
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a cubic function
-        # of the slopes of its normals predicts this share of the variance of the places; near lamps then cost more.
+        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a
+        # cubic function of the slopes of its normals predicts this share of the variance of the
+        # places; near lamps then cost more.
         across = unit(best.normals)[:, :2]
         cubic = across * (across**2).sum(axis=1, keepdims=True)
         terms = np.concatenate((across, cubic, np.ones((len(across), 1))), axis=1)
@@ -170,7 +203,9 @@ class Readings:
         return replace(best, evidence=best.evidence - cost)
 
     def _offset_fits(self, vectors: Float64Array) -> dict[float, _Fit]:
-        """Return fits with constant light, over the value of a pixel that faces the light, and around the best one."""
+        """Return fits with constant light, over the value of a pixel that faces the light, and
+        around the best one.
+        """
         offsets = (0.02 * 1.5**k for k in range(16))
         fits = {offset: _fit(self.values, vectors, offset=offset) for offset in offsets}
         for _ in range(3):  # halve the interval around the best constant light
@@ -205,16 +240,16 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
     # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
     if kind != "intensities" or given.residual < 0.06:
         spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
-        # Spread of the normals (their second largest standard deviation) from which powers have full weight, and the
-        # share of the weight for a plate.
+        # Spread of the normals (their second largest standard deviation) from which powers have
+        # full weight, and the share of the weight for a plate.
         power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
     return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 
 def _cost_of_equal(intensities: Float64Array) -> float:
-    # Intensities that are nearly equal are more likely a curve or a material: up to this cost is added for them, by
-    # the standard deviation of their logarithms.
+    # Intensities that are nearly equal are more likely a curve or a material: up to this cost is
+    # added for them, by the standard deviation of their logarithms.
     return float(10.0 * np.exp(-((np.std(np.log(intensities)) / 0.15) ** 2)))
 
 
@@ -229,7 +264,8 @@ def _fit(
 ) -> _Fit:
     """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
 
-    Values (p, F) are scaled to 1; lights are (F, 3) or (p, F, 3), of any length. Intensities e are 1 or free.
+    Values (p, F) are scaled to 1; lights are (F, 3) or (p, F, 3), of any length. Intensities e are
+    1 or free.
     """
     lit = (values > shadow).astype(np.float64)
     observed = values**gamma
@@ -244,9 +280,13 @@ def _fit(
         if offset:
             facing = (shade(normals, lights) > 0)[..., None]
             # Newton's step on |b|, halved: with much constant light, whole steps miss.
-            next_normals = fit_scaled_normals(observed, weights, facing * lights + offset * unit(normals)[:, None])
+            next_normals = fit_scaled_normals(
+                observed, weights, facing * lights + offset * unit(normals)[:, None]
+            )
             normals = (normals + next_normals) / 2
-            predicted = np.maximum(shade(normals, lights), 0) + offset * np.linalg.norm(normals, axis=1, keepdims=True)
+            predicted = np.maximum(shade(normals, lights), 0) + offset * np.linalg.norm(
+                normals, axis=1, keepdims=True
+            )
         else:
             normals = fit_scaled_normals(observed, weights, lights * intensities[:, None])
             predicted = shade(normals, lights) * intensities
@@ -262,10 +302,14 @@ def _fit(
 def _intensities(
     observed: Float64Array, equal: Float64Array, weights: Float64Array, before: Float64Array
 ) -> Float64Array:
-    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity 1."""
+    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity
+    1.
+    """
     weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
     power = (weights * equal**2).sum(axis=0)
-    found = np.where(power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before)
+    found = np.where(
+        power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before
+    )
     found = np.clip(found / found.mean(), 0.05, 20)
     intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
     return np.asarray(intensities / intensities.mean())

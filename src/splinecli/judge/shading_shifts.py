@@ -1,8 +1,10 @@
-"""Images that are shifted against the others, found by their shading and outline on objects without fine detail.
+"""Images that are shifted against the others, found by their shading and outline on objects without
+fine detail.
 
-A matte model is fitted to the other images under the given lights. Its residual in an image is compared with its
-residual after the image is moved. The light of the image is free, so a wrong direction or intensity is not mistaken for
-a shift: on a ball, moved shading and a moved lamp differ only near the outline and by the shadow.
+A matte model is fitted to the other images under the given lights. Its residual in an image is
+compared with its residual after the image is moved. The light of the image is free, so a wrong
+direction or intensity is not mistaken for a shift: on a ball, moved shading and a moved lamp differ
+only near the outline and by the shadow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +17,23 @@ from splinecli.maths import Bools, Float64Array
 from splinecli.maths.robust import fit_robustly, inverse_3x3, multiply_symmetric
 
 # Falls and residuals are shares of the image's brightness.
-_LEFT = 0.5  # the share of the residual that a shift leaves, in the whole image and most halves of it
+# the share of the residual that a shift leaves, in the whole image and most halves of it
+_LEFT = 0.5
 _MANY_IMAGES = 10
-_DARK, _HIGHLIGHT = 0.1, (1.15, 0.05)  # of a pixel's bright value; a factor of the prediction, and an offset
+# of a pixel's bright value; a factor of the prediction, and an offset
+_DARK, _HIGHLIGHT = (
+    0.1,
+    (1.15, 0.05),
+)
 _PASSES, _FITS = 2, 5
 Shift = tuple[int, int]  # right, down
 _NO_SHIFT = 0.0, (0, 0)
 
 
 def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, Shift]:
-    """Return the shifts in pixels of the sample of images that are shifted, by place, under lights (F, 3)."""
+    """Return the shifts in pixels of the sample of images that are shifted, by place, under lights
+    (F, 3).
+    """
     # Rows and columns of larger captures are left out.
     stride = int(np.ceil(np.sqrt(sample.observations.size / 200_000)))
     mask = sample.mask[::stride, ::stride]
@@ -46,7 +55,11 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
     for place in others if fall > 0 and max(map(abs, shift)) <= farthest else ():
         model.move(place, shift)
     usual = model.usual_residual(range(n_images))
-    found = [(model.find(place, usual)[0], place) for place in range(n_images) if place not in model.shifts]
+    found = [
+        (model.find(place, usual)[0], place)
+        for place in range(n_images)
+        if place not in model.shifts
+    ]
     # An image that was moved back improves the model of the others.
     order = [place for fall, place in sorted(found, reverse=True) if fall > 0]
     for place in order * _PASSES:
@@ -57,8 +70,13 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
 
 
 def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Float64Array]:
-    """Return which pixels (P,) all images show, moved back by shifts in pixels of the sample, and all values (P, F)."""
-    known, values = np.ones(len(sample.observations), np.bool_), sample.observations.astype(np.float64)
+    """Return which pixels (P,) all images show, moved back by shifts in pixels of the sample, and
+    all values (P, F).
+    """
+    known, values = (
+        np.ones(len(sample.observations), np.bool_),
+        sample.observations.astype(np.float64),
+    )
     image = np.zeros(sample.mask.shape)
     for place, shift in shifts.items():
         image[sample.mask] = sample.observations[:, place]
@@ -68,7 +86,9 @@ def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Floa
 
 
 class _Compared(NamedTuple):
-    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and their components."""
+    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and their
+    components.
+    """
 
     left: Float64Array
     unmoved: Float64Array
@@ -79,13 +99,19 @@ class _MatteModel:
     """Scaled normals of images (F, H, W), of which some were moved back by their shifts."""
 
     def __init__(
-        self, images: Float64Array, mask: Bools, light_directions: Float64Array, fitted: Sequence[int] | None = None
+        self,
+        images: Float64Array,
+        mask: Bools,
+        light_directions: Float64Array,
+        fitted: Sequence[int] | None = None,
     ) -> None:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
         self._found: dict[int, _Compared | None] = {}  # of this fit
         # Shifts are compared up to this share of the smaller side of the object.
-        self.reach = max(2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
+        self.reach = max(
+            2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask)))
+        )
         self._values = images[:, mask].T.copy()
         self._known = np.zeros(self._values.shape, np.bool_)
         self._known[:, slice(None) if fitted is None else list(fitted)] = True
@@ -101,7 +127,8 @@ class _MatteModel:
     def _fit(self) -> None:
         self._found.clear()
         known = self._values * self._known
-        bright = int(self._known.any(axis=0).sum()) // 8  # highlights: the brightest eighth of the images
+        # highlights: the brightest eighth of the images
+        bright = int(self._known.any(axis=0).sum()) // 8
         self._top = np.maximum(np.partition(known, -1 - bright, axis=1)[:, -1 - bright], 1e-12)
         values = self._values / self._top[:, None]
         lit = np.where(values > _DARK, 1.0, 1e-3) * np.where(self._known, 1.0, 1e-4)
@@ -109,10 +136,14 @@ class _MatteModel:
         self._left = values - self._normals @ self.lights.T
         x, y, z = self.lights.T
         products = self._weights @ np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
-        self._covariance = inverse_3x3(tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6)
+        self._covariance = inverse_3x3(
+            tuple(products.T + np.array([[1e-6]] * 3 + [[0.0]] * 3)), 1e-6
+        )
 
     def _without(self, place: int) -> Float64Array:
-        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they are implausible."""
+        """Return the scaled normals (P, 3) without an image (Sherman and Morrison); zero where they
+        are implausible.
+        """
         light, weights = self.lights[place], self._weights[:, place]
         turn = np.stack(multiply_symmetric(self._covariance, tuple(light)), axis=1)
         amount = weights * self._left[:, place] / np.maximum(1 - weights * (turn @ light), 0.05)
@@ -126,10 +157,11 @@ class _MatteModel:
         return self._found[place]
 
     def _compare(self, place: int) -> _Compared | None:
-        """Return how the model fits an image at all shifts; None if it does not apply to this image.
+        """Return how the model fits an image at all shifts; None if it does not apply to this
+        image.
 
-        Shadows and highlights of the image are left out, but not pixels that are dark although the model predicts
-        light.
+        Shadows and highlights of the image are left out, but not pixels that are dark although the
+        model predicts light.
         """
         normals, image = self._without(place), self.images[place][self.mask]
         predicted, values = np.maximum(normals @ self.lights[place], 0), image / self._top
@@ -137,11 +169,21 @@ class _MatteModel:
         kept = ~shadow & (values <= _HIGHLIGHT[0] * predicted + _HIGHLIGHT[1])
         if kept.mean() < 0.3:
             return None
-        good, scaled = self._map(np.asarray(normals.any(axis=1))), self._map(normals * self._top[:, None])
+        good, scaled = (
+            self._map(np.asarray(normals.any(axis=1))),
+            self._map(normals * self._top[:, None]),
+        )
         kept, image = self._map(kept), self._map(image * kept)
-        products = np.stack([scaled[row] * scaled[column] for row, column in zip(*np.triu_indices(3), strict=True)])
+        products = np.stack(
+            [scaled[row] * scaled[column] for row, column in zip(*np.triu_indices(3), strict=True)]
+        )
         overlap = self._sums(good, kept)
-        left = _residual(overlap, self._sums(products, kept), self._sums(scaled, image), self._sums(good, image**2))
+        left = _residual(
+            overlap,
+            self._sums(products, kept),
+            self._sums(scaled, image),
+            self._sums(good, image**2),
+        )
         unmoved = _residual(  # in the pixels that the moved image covers
             self._sums(good * kept, self.mask),
             self._sums(products * kept, self.mask),
@@ -150,7 +192,9 @@ class _MatteModel:
         )
         brightness = max(float(np.sqrt((image**2).sum() / kept.sum())), 1e-12)
         enough = overlap > 0.5 * overlap.max()
-        left, unmoved = (np.where(enough, values / brightness, np.inf) for values in (left, unmoved))
+        left, unmoved = (
+            np.where(enough, values / brightness, np.inf) for values in (left, unmoved)
+        )
         return _Compared(left, unmoved, (scaled, good, kept, image))
 
     def usual_residual(self, places: Sequence[int]) -> float:
@@ -160,28 +204,41 @@ class _MatteModel:
         return float(np.quantile(still, 0.25)) if still else np.inf
 
     def find(self, place: int, usual: float) -> tuple[float, Shift]:
-        """Return the shift with the smallest residual, and the reduction; 0 if it is not accepted."""
+        """Return the shift with the smallest residual, and the reduction;
+        0 if it is not accepted.
+        """
         compared = self._compared(place)
         if compared is None:
             return _NO_SHIFT
         # Gloss on a rendered sphere under eight lights reached 0.4.
         most_left = _LEFT if len(self.images) >= _MANY_IMAGES else 0.35
         fall, shift = _least(compared.left, compared.unmoved, 0.03, most_left, usual)
-        return (fall, shift) if fall and self._left_in_halves(*compared.maps, shift) <= _LEFT else _NO_SHIFT
+        return (
+            (fall, shift)
+            if fall and self._left_in_halves(*compared.maps, shift) <= _LEFT
+            else _NO_SHIFT
+        )
 
     def find_common(self, places: Sequence[int], usual: float) -> tuple[float, Shift]:
         """Return the same for images that may all have the same shift."""
         found = [compared for compared in map(self._compared, places) if compared is not None]
         if len(found) < len(places) / 2:
             return _NO_SHIFT
-        with np.errstate(invalid="ignore", divide="ignore"):  # medians, so that one shifted image does not decide
+        with np.errstate(
+            invalid="ignore", divide="ignore"
+        ):  # medians, so that one shifted image does not decide
             shares = np.median([each.left / each.unmoved for each in found], axis=0)
         unmoved = np.median([each.unmoved for each in found], axis=0)
         known = np.isfinite(shares) & np.isfinite(unmoved)
         return _least(np.where(known, shares * unmoved, np.inf), unmoved, 0.02, 0.6, usual)
 
     def _left_in_halves(
-        self, scaled: Float64Array, good: Float64Array, kept: Float64Array, image: Float64Array, shift: Shift
+        self,
+        scaled: Float64Array,
+        good: Float64Array,
+        kept: Float64Array,
+        image: Float64Array,
+        shift: Shift,
     ) -> float:
         """Return the median share that a shift leaves in the upper, lower, left and right half.
 
@@ -197,7 +254,9 @@ class _MatteModel:
         before = residuals(image, kept * _moved(self.mask, shift))
         largest = 3 * np.nanmean(before)
         shares = []
-        for places, middle in zip(np.indices(image.shape), map(np.median, np.nonzero(self.mask)), strict=True):
+        for places, middle in zip(
+            np.indices(image.shape), map(np.median, np.nonzero(self.mask)), strict=True
+        ):
             for half in (places <= middle, places > middle):
                 found = [each[half & ~np.isnan(each)].clip(max=largest) for each in (after, before)]
                 if all(map(len, found)):
@@ -211,7 +270,9 @@ class _MatteModel:
         return array
 
     def _sums(self, first: Float64Array, second: Float64Array | Bools) -> Float64Array:
-        """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right) within reach."""
+        """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right)
+        within reach.
+        """
         from scipy.fft import irfft2, next_fast_len, rfft2
 
         shape = [next_fast_len(side + self.reach, real=True) for side in self.mask.shape]
@@ -223,14 +284,17 @@ class _MatteModel:
 def _least(
     left: Float64Array, unmoved: Float64Array, least_fall: float, most_left: float, usual: float
 ) -> tuple[float, Shift]:
-    """Return the fall of the residual at the shift with the smallest remaining share; residuals are (h, w)."""
+    """Return the fall of the residual at the shift with the smallest remaining share; residuals are
+    (h, w).
+    """
     reach = len(left) // 2
     around = np.abs(np.arange(-reach, reach + 1))
     # Wrong models often keep improving towards the largest shifts.
     near = np.maximum(around[:, None], around) <= 0.75 * reach
     with np.errstate(invalid="ignore"):
-        # The residual of a shifted image is so many times the lower quartile of the images' residuals. If the model
-        # fits no image well, as on polished balls, it does not show which is shifted. Metals leave more than 0.6.
+        # The residual of a shifted image is so many times the lower quartile of the images'
+        # residuals. If the model fits no image well, as on polished balls, it does not show which
+        # is shifted. Metals leave more than 0.6.
         counts = near & (unmoved - left >= least_fall) & (unmoved <= 0.6) & (unmoved >= 2.0 * usual)
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]
@@ -240,10 +304,13 @@ def _least(
     return float(unmoved[row, column] - left[row, column]), (int(column) - reach, int(row) - reach)
 
 
-def _residual(count: Float64Array, products: Float64Array, sums: Float64Array, squares: Float64Array) -> Float64Array:
+def _residual(
+    count: Float64Array, products: Float64Array, sums: Float64Array, squares: Float64Array
+) -> Float64Array:
     """Return root mean square residuals at each shift (h, w) of a fit with the best light.
 
-    From the sums over pixels of scaled normals times each other (6, h, w), and of images times these (3, h, w).
+    From the sums over pixels of scaled normals times each other (6, h, w), and of images times
+    these (3, h, w).
     """
     matrices = np.moveaxis(products[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], (0, 1), (-2, -1))
     trace = np.trace(matrices, axis1=-2, axis2=-1)
@@ -258,7 +325,8 @@ def _moved(image: Float64Array | Bools, shift: Shift) -> Float64Array:
     moved = np.zeros(image.shape)
     places = list(zip(shift[::-1], image.shape, strict=True))
     to, source = (
-        tuple(slice(max(0, by * sign), min(side, side + by * sign)) for by, side in places) for sign in (-1, 1)
+        tuple(slice(max(0, by * sign), min(side, side + by * sign)) for by, side in places)
+        for sign in (-1, 1)
     )
     moved[to] = image[source]
     return moved

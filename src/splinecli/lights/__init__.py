@@ -1,1 +1,3 @@
-"""Lights that are found or refined, and the light that reaches each pixel: near lamps, interreflection."""
+"""Lights that are found or refined, and the light that reaches each pixel: near lamps,
+interreflection.
+"""

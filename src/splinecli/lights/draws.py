@@ -11,20 +11,26 @@ DRAWS_STREAM = 1  # of the seed; evaluations have two more, so that all are inde
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
 
-def draw_lights(light_directions: Float64Array, n_lights: int | None, *, trials: int = 1, seed: int = 0) -> list[Draw]:
+def draw_lights(
+    light_directions: Float64Array, n_lights: int | None, *, trials: int = 1, seed: int = 0
+) -> list[Draw]:
     """Return random draws of lights without replacement, each in ascending order.
 
-    Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the same number of lights
-    get the same draws, and additional trials extend the same list. A draw is repeated only if its lights are coplanar,
-    because no method can solve it. All lights together, or `n_lights` of None, form one draw.
+    Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the
+    same number of lights get the same draws, and additional trials extend the same list. A draw is
+    repeated only if its lights are coplanar, because no method can solve it. All lights together,
+    or `n_lights` of None, form one draw.
 
-    Raises UsageError for settings that are out of range, or InputError if the lights of every draw were coplanar.
+    Raises UsageError for settings that are out of range, or InputError if the lights of every draw
+    were coplanar.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
         hint = f"Use --n-lights {available}, or fewer"
-        raise UsageError(f"the capture has {available} lights, too few for draws of {n_lights}", hint=hint)
+        raise UsageError(
+            f"the capture has {available} lights, too few for draws of {n_lights}", hint=hint
+        )
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
     return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
@@ -43,10 +49,12 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(1000):
-        # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the same in later NumPy
-        # versions.
+        # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the
+        # same in later NumPy versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
     problem = f"all of 1000 draws of {n_lights} lights are in one plane"
-    raise InputError(problem, hint="Choose more lights, or lights that surround the viewing direction")
+    raise InputError(
+        problem, hint="Choose more lights, or lights that surround the viewing direction"
+    )

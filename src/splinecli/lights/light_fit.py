@@ -1,15 +1,17 @@
-"""How well images fit light directions, also in other orders of the lights, and rough directions refined by the images.
+"""How well images fit light directions, also in other orders of the lights, and rough directions
+refined by the images.
 
-The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
-(Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
-factors are found without the lights. Correct lights are linear combinations of these factors in any frame. Lights in a
-wrong order are not.
+The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled
+normals times lights (Woodham 1980; Hayakawa, "Photometric stereo under a light source with
+arbitrary motion", JOSA A 1994). Its three factors are found without the lights. Correct lights are
+linear combinations of these factors in any frame. Lights in a wrong order are not.
 
-To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is
-linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a
-prior around the given ones. The prior fixes the remaining freedom: lights and normals may rotate together. If the
-light intensities are known, no other freedom remains. If not, a prior on them fixes the generalised bas-relief
-ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999).
+To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte
+surface, each step is linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018)
+with directions that are free, too, within a prior around the given ones. The prior fixes the
+remaining freedom: lights and normals may rotate together. If the light intensities are known, no
+other freedom remains. If not, a prior on them fixes the generalised bas-relief ambiguity
+(Belhumeur, Kriegman and Yuille, IJCV 1999).
 """
 
 from __future__ import annotations
@@ -40,11 +42,13 @@ _PRIOR = 1e-9
 class Factors:
     """The best factors of rank 3 of some observations."""
 
-    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
-    # matrices is one between images, as a share of the mean brightness
+    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a
+    # distance between two such matrices is one between images, as a share of the mean brightness
     matrix: Float64Array
-    image_residuals: Float64Array  # (F,), RMS residual of each image after the fit of the factors, in this unit
-    intensities_known: bool = True  # whether the observations were divided by measured light intensities
+    # (F,), RMS residual of each image after the fit of the factors, in this unit
+    image_residuals: Float64Array
+    # whether the observations were divided by measured light intensities
+    intensities_known: bool = True
 
     @property
     def residual(self) -> float:
@@ -52,11 +56,15 @@ class Factors:
         return float(np.linalg.norm(self.image_residuals))
 
     def with_free_intensities(self) -> Factors:
-        """Return the factors of the same observations, to be compared with lights of any intensities."""
+        """Return the factors of the same observations, to be compared with lights of any
+        intensities.
+        """
         return replace(self, intensities_known=False)
 
     def misfits(self, light_directions: Float64Array) -> Float64Array:
-        """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
+        """Return the root mean square distances (N,) from the images that lights (N, F, 3) can
+        explain.
+        """
         if self.intensities_known:
             return self.distances(np.linalg.qr(light_directions)[0])
         intensities, matrices = self._fit_intensities(light_directions)
@@ -64,7 +72,9 @@ class Factors:
         return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
 
     def distances(self, bases: Float64Array) -> Float64Array:
-        """Return the root mean square distances (N,) from the images that orthonormal bases (N, F, 3) can explain."""
+        """Return the root mean square distances (N,) from the images that orthonormal bases (N, F,
+        3) can explain.
+        """
         explained = ((self.matrix @ bases) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
 
@@ -75,9 +85,12 @@ class Factors:
         return self._fit_intensities(light_directions)[0]
 
     def _fit_intensities(self, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give."""
-        # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et al., TPAMI 2018).
-        # The weight of equal intensities against those that fit best, if none were measured.
+        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would
+        give.
+        """
+        # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et
+        # al., TPAMI 2018). The weight of equal intensities against those that fit best, if none
+        # were measured.
         prior = 0.01 * (self.matrix**2).sum(axis=0).mean()
         intensities = np.ones(light_directions.shape[:2])
         for _ in range(12):
@@ -94,7 +107,8 @@ class Factors:
 def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
     """Return the factors of observations (P, F), or None if too few of them are lit.
 
-    Shadows are left out, and highlights get small weights: least absolute deviations, by weighted least squares.
+    Shadows are left out, and highlights get small weights: least absolute deviations, by weighted
+    least squares.
     """
     values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
@@ -131,7 +145,9 @@ def random_misfits(factors: Factors, light_directions: Float64Array) -> Float64A
 
 
 def shifted_orders(n_lights: int) -> NDArray[np.int64]:
-    """Return the orders (2 F, F): all cyclic shifts, then all shifts of the reversed order; the first is as given."""
+    """Return the orders (2 F, F): all cyclic shifts, then all shifts of the reversed order; the
+    first is as given.
+    """
     steps = np.arange(n_lights)
     forward = (steps[None] + steps[:, None]) % n_lights
     return np.concatenate((forward, forward[:, ::-1]))
@@ -147,7 +163,8 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
 
 
 def fit_residual(values: Float64Array, light_directions: Float64Array) -> float:
-    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3).
+    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations
+    under lights (F, 3).
 
     It is a share of the mean of the lit values.
     """
@@ -160,8 +177,8 @@ def fit_residual(values: Float64Array, light_directions: Float64Array) -> float:
 def sample_pixels(observations: Floats) -> Float64Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     n_lights = observations.shape[1]
-    # Pixels below this share of the brightest hundredth are left out as background. The second share is used if the
-    # first leaves too few, because highlights outshine the object.
+    # Pixels below this share of the brightest hundredth are left out as background. The second
+    # share is used if the first leaves too few, because highlights outshine the object.
     for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(4000, max(120_000 // n_lights, 1)))
         # Three unknowns need more than three lit observations to leave a residual.
@@ -175,9 +192,10 @@ class LightFit(NamedTuple):
     """Lights that fit the images best near given ones."""
 
     directions: Float64Array  # (F, 3), unit
-    intensities: Float64Array  # (F,), relative to the intensities by which the observations were divided
-    # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
-    # observation
+    # (F,), relative to the intensities by which the observations were divided
+    intensities: Float64Array
+    # before, after: the median residuals under the given lights and under these, as shares of a
+    # pixel's brightest observation
     before: float
     after: float
 
@@ -187,17 +205,23 @@ class LightFit(NamedTuple):
         return self.after / max(self.before, 1e-12)
 
 
-def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
-    """Return the capture with refined lights, or unchanged if they do not fit much better. A warning says which.
+def refine_capture(
+    capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True
+) -> Capture:
+    """Return the capture with refined lights, or unchanged if they do not fit much better. A
+    warning says which.
 
-    `error_deg` is the usual error of the given directions, by default LIGHT_ERROR_DEG. Raises UsageError if the capture
-    has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
+    `error_deg` is the usual error of the given directions, by default LIGHT_ERROR_DEG. Raises
+    UsageError if the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
     """
     check_distant("--refine-lights", "refines", near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
     check_light_error(error_deg, refines=True)
     found = refine_lights(
-        capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
+        capture.observations,
+        capture.light_directions,
+        error_deg=error_deg,
+        intensities_known=intensities_known,
     )
     if found is None:
         reason = "no directions near them fit the images much better"
@@ -205,14 +229,17 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
             reason = f"there are fewer than {MIN_LIGHTS} lights"
         elif _choose_pixels(capture.observations) is None:
             reason = f"there are fewer than {_MIN_PIXELS} lit pixels"
-        kept = CaptureWarning(REFINEMENT_REJECTED, f"The light directions were not refined: {reason}.")
+        kept = CaptureWarning(
+            REFINEMENT_REJECTED, f"The light directions were not refined: {reason}."
+        )
         return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:
         intensities = found.intensities if intensities is None else intensities * found.intensities
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
     text = (
-        f"The light directions were refined: they moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f"The light directions were refined: they moved by {moved_deg.mean():.1f} degrees on"
+        " average, at most"
         f" {moved_deg.max():.1f}, which reduces the residual to {100 * found.fit_ratio:.0f} %."
     )
     return replace(
@@ -224,13 +251,17 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     )
 
 
-def would_refine(observations: Floats, factors: Factors | None, light_directions: Float64Array) -> LightFit | None:
-    """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
+def would_refine(
+    observations: Floats, factors: Factors | None, light_directions: Float64Array
+) -> LightFit | None:
+    """Return the lights that refinement would give if they fit observations (P, F) much better, or
+    None.
 
-    It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the observations.
+    It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the
+    observations.
     """
-    # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is not tried only to
-    # be suggested. Few matte or shiny captures with exact lights exceed it.
+    # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is
+    # not tried only to be suggested. Few matte or shiny captures with exact lights exceed it.
     if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
     # The directions are not to blame for unmeasured intensities.
@@ -239,20 +270,30 @@ def would_refine(observations: Floats, factors: Factors | None, light_directions
 
 
 def check_distant(option: str, verb: str, *, near: bool) -> None:
-    """Raise UsageError for a capture with near lamps under an option that refines or finds distant lights."""
+    """Raise UsageError for a capture with near lamps under an option that refines or finds distant
+    lights.
+    """
     if near:
-        raise UsageError(f"{option} {verb} distant lights, and this capture has near lamps", hint=f"Leave {option} out")
+        raise UsageError(
+            f"{option} {verb} distant lights, and this capture has near lamps",
+            hint=f"Leave {option} out",
+        )
 
 
 def check_light_error(error_deg: float | None, *, refines: bool) -> None:
-    """Raise UsageError for a usual error of directions that is out of range, or given although none are refined."""
+    """Raise UsageError for a usual error of directions that is out of range, or given although none
+    are refined.
+    """
     if error_deg is None:
         return
     if not refines:
-        raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
+        raise UsageError(
+            "--light-error-deg needs --refine-lights", hint="Add it, or leave both out"
+        )
     if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
         raise UsageError(
-            f"the light error is {error_deg:g} degrees, expected above 0 and at most {LARGEST_LIGHT_ERROR_DEG:g}"
+            f"the light error is {error_deg:g} degrees, expected above 0 and at most"
+            f" {LARGEST_LIGHT_ERROR_DEG:g}"
         )
 
 
@@ -263,18 +304,26 @@ def refine_lights(
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
 ) -> LightFit | None:
-    """Return refined lights; None if the images do not determine them, or the given lights fit about as well.
+    """Return refined lights; None if the images do not determine them, or the given lights fit
+    about as well.
 
-    The observations (P, F) are linear, divided by the light intensities; the directions (F, 3) are unit. See
-    refine_capture for the other arguments.
+    The observations (P, F) are linear, divided by the light intensities; the directions (F, 3) are
+    unit. See refine_capture for the other arguments.
     """
     intensity_error = 0.0 if intensities_known else INTENSITY_ERROR
-    fit = fit_near(observations, light_directions, error_deg, intensity_error=intensity_error, worth_pixels=50.0)
+    fit = fit_near(
+        observations,
+        light_directions,
+        error_deg,
+        intensity_error=intensity_error,
+        worth_pixels=50.0,
+    )
     if fit is None:
         return None
-    # Refined lights are taken if the median residual falls below the second share of that under the given lights. On
-    # rendered captures with exact lights, it seldom does; docs/measurements.md has the figures. Metals have a larger
-    # residual than the first, and a matte model would move their lights wrongly.
+    # Refined lights are taken if the median residual falls below the second share of that under the
+    # given lights. On rendered captures with exact lights, it seldom does; docs/measurements.md has
+    # the figures. Metals have a larger residual than the first, and a matte model would move their
+    # lights wrongly.
     better = fit.after < 0.018 and fit.fit_ratio < 0.7 and bool((fit.directions[:, 2] > 0).all())
     return fit if better else None
 
@@ -287,11 +336,13 @@ def fit_near(
     intensity_error: float,
     worth_pixels: float,
 ) -> LightFit | None:
-    """Return the lights near the given ones that fit the images best; None for too few lights or lit pixels.
+    """Return the lights near the given ones that fit the images best; None for too few lights or
+    lit pixels.
 
-    The observations (P, F) are linear, and the directions (F, 3) are unit. `error_deg` is the usual error of each
-    direction (F,), or of all; `intensity_error` is a share, 0 for known intensities. `worth_pixels` is the
-    number of pixels that the images weigh against the prior, because errors of a matte model are alike in many.
+    The observations (P, F) are linear, and the directions (F, 3) are unit. `error_deg` is the usual
+    error of each direction (F,), or of all; `intensity_error` is a share, 0 for known intensities.
+    `worth_pixels` is the number of pixels that the images weigh against the prior, because errors
+    of a matte model are alike in many.
     """
     values = _choose_pixels(observations)
     if values is None:
@@ -301,18 +352,23 @@ def fit_near(
     lights = light_directions
     normals, weights = fit_robustly(values, lit, lights, 8)
     before = _misfit(values, normals, lights, lit)
-    # The precision (F, 3, 3) of the given light vectors, along and across them. The angle has two components, each with
-    # half of its variance.
+    # The precision (F, 3, 3) of the given light vectors, along and across them. The angle has two
+    # components, each with half of its variance.
     along = lights[:, :, None] * lights[:, None, :]
     across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
-    precision = (np.eye(3) - along) / across_variance + along / (intensity_error or INTENSITY_ERROR) ** 2
+    precision = (np.eye(3) - along) / across_variance + along / (
+        intensity_error or INTENSITY_ERROR
+    ) ** 2
     for _ in range(150):
         normals, weights = fit_robustly(values, lit, lights, 2, weights)
         residuals = values - normals @ lights.T
         variance = (weights * residuals**2).sum() / weights.sum()
         # A light that does not reach any pixel keeps its given vector.
         scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
-        curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
+        curvature = (
+            np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True)
+            * scale[:, None, None]
+        )
         gradient = ((weights * residuals).T @ normals) * scale[:, None]
         pull = np.einsum("fij,fj->fi", precision, light_directions - lights)
         step = np.linalg.solve(curvature + precision, (gradient + pull)[..., None])[..., 0]
@@ -326,12 +382,16 @@ def fit_near(
 
 
 def _choose_pixels(observations: Float32Array) -> Float64Array | None:
-    """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
+    """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too
+    few.
+    """
     if observations.shape[1] < MIN_LIGHTS:
         return None
     _, values = lit_values(observations, 0.02, 2000)
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 
-def _misfit(values: Float64Array, normals: Float64Array, lights: Float64Array, lit: Float64Array) -> float:
+def _misfit(
+    values: Float64Array, normals: Float64Array, lights: Float64Array, lit: Float64Array
+) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))

@@ -1,4 +1,6 @@
-"""The light network, which estimates the light direction and relative intensity of each image in a capture."""
+"""The light network, which estimates the light direction and relative intensity of each image in a
+capture.
+"""
 
 from functools import cache
 from importlib import resources
@@ -8,10 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, softplus
 
-from splinecli.system.weight_files import (
-    SHIPPED,
-    load_module,
-)
+from splinecli.system.weight_files import SHIPPED, load_module
 
 LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
 
@@ -24,14 +23,17 @@ class LightGuess(NamedTuple):
 
     directions: Tensor  # (B, F, 3), unit; the modes of von Mises-Fisher distributions
     sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
-    log_intensities: Tensor  # (B, F), the logarithms of the intensities; their mean over each capture is zero
+    # (B, F), the logarithms of the intensities; their mean over each capture is zero
+    log_intensities: Tensor
 
 
 class LightNet(nn.Module):
-    """An encoder, shared by all images, that exchanges information between the images at three depths.
+    """An encoder, shared by all images, that exchanges information between the images at three
+    depths.
 
-    At each depth, the features of an image are concatenated with the maximum and the mean over all images. LCNet (Chen
-    et al., "Self-calibrating deep photometric stereo networks", CVPR 2019) does this once.
+    At each depth, the features of an image are concatenated with the maximum and the mean over all
+    images. LCNet (Chen et al., "Self-calibrating deep photometric stereo networks", CVPR 2019) does
+    this once.
     """
 
     def __init__(self) -> None:
@@ -43,7 +45,10 @@ class LightNet(nn.Module):
         )
         self.join1 = nn.Conv2d(3 * local, joined, 1)
         self.middle = nn.ModuleList(
-            (nn.Conv2d(joined, middle, 3, stride=2, padding=1), nn.Conv2d(middle, middle, 3, padding=1))
+            (
+                nn.Conv2d(joined, middle, 3, stride=2, padding=1),
+                nn.Conv2d(middle, middle, 3, padding=1),
+            )
         )
         self.join2 = nn.Conv2d(3 * middle, coarse, 1)
         self.coarse = nn.Conv2d(coarse, coarse, 3, stride=2, padding=1)
@@ -54,7 +59,9 @@ class LightNet(nn.Module):
     def forward(self, images: Tensor) -> LightGuess:
         """Estimate the lights of images (B, F, INPUTS, SIDE, SIDE); see network_inputs."""
         captures, lights = images.shape[:2]
-        x = torch.relu(self.enter(images.flatten(0, 1).contiguous(memory_format=torch.channels_last)))
+        x = torch.relu(
+            self.enter(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+        )
         x = torch.relu(self.local[0](x))
         x = torch.relu(x + self.local[1](x))
         x = torch.relu(self.join1(_with_all(x, lights)))
@@ -68,22 +75,27 @@ class LightNet(nn.Module):
         # The limits correspond to errors of 90 degrees and 1 degree.
         sharpness = (3 + found[..., 3]).clamp(-2.0, 8.5)
         intensities = found[..., 4] - found[..., 4].mean(dim=1, keepdim=True)
-        return LightGuess(normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities)
+        return LightGuess(
+            normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities
+        )
 
 
 def _with_all(x: Tensor, lights: int) -> Tensor:
-    """Concatenate features (B * F, C, ...) of images with their maximum and mean over the images of each capture."""
+    """Concatenate features (B * F, C, ...) of images with their maximum and mean over the images of
+    each capture.
+    """
     each = x.view(-1, lights, *x.shape[1:])
     largest, mean = each.amax(dim=1, keepdim=True), each.mean(dim=1, keepdim=True)
     return torch.cat((each, largest.expand_as(each), mean.expand_as(each)), dim=2).flatten(0, 1)
 
 
 def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
-    """Return the input channels (F, INPUTS, H, W) for images (F, H, W): linear, non-negative, of any scale.
+    """Return the input channels (F, INPUTS, H, W) for images (F, H, W): linear, non-negative, of
+    any scale.
 
-    Channels: the image; the image divided by the mean of all images, which hardly depends on the material; that mean;
-    and the mask (H, W), 1 on the object, else 0. The first and the third are square roots, relative to the object's
-    mean brightness.
+    Channels: the image; the image divided by the mean of all images, which hardly depends on the
+    material; that mean; and the mask (H, W), 1 on the object, else 0. The first and the third are
+    square roots, relative to the object's mean brightness.
     """
     images = images * mask
     mean = images.mean(dim=0)
@@ -95,9 +107,11 @@ def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
 
 
 def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Crop images (F, H, W) to the bounding box of a mask (H, W), pad them to squares and resize them to SIDE.
+    """Crop images (F, H, W) to the bounding box of a mask (H, W), pad them to squares and resize
+    them to SIDE.
 
-    Returns images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros and ones.
+    Returns images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros
+    and ones.
     """
     rows, columns = (mask.any(dim=1 - axis).nonzero()[:, 0] for axis in (0, 1))
     box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -1,15 +1,17 @@
-"""The light of near lamps on a surface: points in space, and observations as distant lamps would give them.
+"""The light of near lamps on a surface: points in space, and observations as distant lamps would
+give them.
 
 Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
 
-The photographs show how bright each visible part of the object is under each light, after all reflections. A matte part
-is as bright from all sides. Estimated normals give the surface. Together they give the light that arrives at a pixel
-from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV
-1991, also alternate between the shape and the light on it.)
+The photographs show how bright each visible part of the object is under each light, after all
+reflections. A matte part is as bright from all sides. Estimated normals give the surface. Together
+they give the light that arrives at a pixel from the rest of the object, and the pixel reflects it.
+(Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, also alternate between the
+shape and the light on it.)
 
-Two things are unknown: the exposure, that is the observation for an albedo of 1, and whether the object is matte
-enough. Attached shadows show both, because a pixel reflects only indirect light if the lamp is behind its tangent
-plane.
+Two things are unknown: the exposure, that is the observation for an albedo of 1, and whether the
+object is matte enough. Attached shadows show both, because a pixel reflects only indirect light if
+the lamp is behind its tangent plane.
 """
 
 from __future__ import annotations
@@ -31,12 +33,15 @@ from splinecli.system.machine import side_by_side
 def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Floats) -> Float32Array:
     """Return the points (N, 3) of a surface, in the unit of the lamps' positions.
 
-    Rows and columns (N,) are in pixels; (0, 0) is the centre of the first pixel. The depth (N,) is as integrate_normals
-    returns it: the height in pixels, or with a camera matrix the depth, here in multiples of the mean plane's depth.
+    Rows and columns (N,) are in pixels; (0, 0) is the centre of the first pixel. The depth (N,) is
+    as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here
+    in multiples of the mean plane's depth.
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
-        points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
+        points = (
+            np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
+        )
     else:
         rays = rays_at(rows, columns, lamps.camera_matrix)
         points = rays * (depth * _plane_distance(lamps))[:, None] + _camera_position(lamps)
@@ -53,10 +58,11 @@ class PixelLighting:
     """Observations as distant lamps would give them, with the light directions of each pixel."""
 
     observations: Float32Array  # (P, F), without the falloff of the lamps
-    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for distant lights and an
-    # orthographic camera
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for
+    # distant lights and an orthographic camera
     directions: Floats
-    turns: Float32Array | None = None  # (P, 3, 3), rotations from the capture's frame to these; None if all are equal
+    # (P, 3, 3), rotations from the capture's frame to these; None if all are equal
+    turns: Float32Array | None = None
 
     @classmethod
     def of(cls, observations: Float32Array, lamps: NearLamps) -> PixelLighting:
@@ -71,26 +77,35 @@ class PixelLighting:
 
     @classmethod
     def distant(cls, observations: Float32Array, directions: Floats, rays: Floats) -> PixelLighting:
-        """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3) from the camera."""
+        """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3)
+        from the camera.
+        """
         turns = _turns_to_view(unit(-rays)).astype(np.float32)
-        return cls(observations, np.einsum("pij,fj->pfi", turns, directions.astype(np.float32)), turns)
+        return cls(
+            observations, np.einsum("pij,fj->pfi", turns, directions.astype(np.float32)), turns
+        )
 
     def in_frame_of_pixels(self, normals: Floats) -> Floats:
         """Return normals (P, 3), given in the capture's frame, in the pixels' own."""
         return normals if self.turns is None else np.einsum("pij,pj->pi", self.turns, normals)
 
     def in_frame_of_capture(self, vectors: Floats) -> Floats:
-        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' own frames, in the capture's."""
+        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' own frames, in the
+        capture's.
+        """
         return vectors if self.turns is None else np.einsum("pji,p...j->p...i", self.turns, vectors)
 
 
 PixelIndices = Integers  # numbers of some of a capture's pixels, in the order of its mask
 # From rows of a capture's pixels to their observations and light directions.
 LightingAt = Callable[[PixelIndices], PixelLighting]
-LIT_AT_ONCE = 1 << 14  # pixels whose light is requested at once: under near lamps, each has its own lights
+# pixels whose light is requested at once: under near lamps, each has its own lights
+LIT_AT_ONCE = 1 << 14
 
 
-def parts_of_pixels(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[PixelIndices]:
+def parts_of_pixels(
+    count: int, size: int = LIT_AT_ONCE, *, step: int = 1
+) -> Iterator[PixelIndices]:
     """Yield every step-th of the rows below `count`, `size` at a time."""
     for start in range(0, count, step * size):
         yield np.arange(start, min(start + step * size, count), step)
@@ -103,7 +118,9 @@ def _plane_distance(lamps: NearLamps) -> float:
 
 
 def _camera_position(lamps: NearLamps) -> Floats:
-    """Return the camera's place (3,): the image's middle shows the origin, at the distance of the mean plane."""
+    """Return the camera's place (3,): the image's middle shows the origin, at the distance of the
+    mean plane.
+    """
     assert lamps.camera_matrix is not None
     row, column = lamps.middle
     middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
@@ -135,7 +152,8 @@ class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
     blocks: Blocks  # of the mask's pixels
-    arriving: Float32Array  # (h, w, F), the light at each block from the others. Other cells copy the nearest block
+    # (h, w, F), the light at each block from the others. Other cells copy the nearest block
+    arriving: Float32Array
     albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
@@ -145,25 +163,33 @@ class IndirectLight:
         return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
     def remove(self, observations: Float32Array, pixels: PixelIndices) -> Float32Array:
-        """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
+        """Return the observations (n, F) of some of the capture's pixels without their indirect
+        part.
+        """
         # Keep a share of each observation, because the gathered light is never exact.
-        return np.asarray(np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32)
+        return np.asarray(
+            np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32
+        )
 
     def counts_at(self, observations: Float32Array, pixels: PixelIndices) -> Bools:
-        """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
-        # Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most.
+        """Return for which of some pixels (n,) with observations (n, F) the indirect part is not
+        negligible.
+        """
+        # Indirect light up to this share of a pixel's largest observation changes mean errors by
+        # 0.01 degrees at most.
         return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
 def find_indirect_light(
     mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
 ) -> IndirectLight | None:
-    """Return the indirect light of a capture, or None if the attached shadows show none that could be removed.
+    """Return the indirect light of a capture, or None if the attached shadows show none that could
+    be removed.
 
-    The camera is always treated as orthographic, because only nearby parts exchange much light. The mask (H, W) has P
-    true pixels. The observations (P, F) are as they were photographed, divided by the intensities alone; `lighting_at`
-    gives them without the falloff of near lamps, and the light directions. The normals (P, 3) are unit, in the
-    capture's frame.
+    The camera is always treated as orthographic, because only nearby parts exchange much light. The
+    mask (H, W) has P true pixels. The observations (P, F) are as they were photographed, divided by
+    the intensities alone; `lighting_at` gives them without the falloff of near lamps, and the light
+    directions. The normals (P, 3) are unit, in the capture's frame.
     """
     pixels = PixelPlaces(mask)
     parts = partial(parts_of_pixels, len(normals))
@@ -188,8 +214,8 @@ def find_indirect_light(
 
     def sum_up(rows: PixelIndices) -> Float64Array:
         rows = rows[lit[rows]]
-        # A block sends at most this many times the light of a matte one that faces the lamp. The rest is a
-        # highlight, which goes in another direction.
+        # A block sends at most this many times the light of a matte one that faces the lamp. The
+        # rest is a highlight, which goes in another direction.
         most = 3.0 * albedo[rows, None]
         sent = observations[rows] * (most / lighting_at(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
@@ -204,18 +230,21 @@ def find_indirect_light(
     exposure = _exposure(indirect, observations, lighting_at, normals)
     if exposure is None:
         return None
-    # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak
-    # if the reflecting surface is hidden from the camera.
+    # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light
+    # is too weak if the reflecting surface is hidden from the camera.
     exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
     # Pixels that all lamps graze may have any albedo.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
-def _exchange(blocks: Blocks, covered: Float64Array, normals: Float64Array, sent: Float64Array) -> Float32Array:
-    """Return the light (p, F) that arrives at each block from the others, relative to the light a white one reflects.
+def _exchange(
+    blocks: Blocks, covered: Float64Array, normals: Float64Array, sent: Float64Array
+) -> Float32Array:
+    """Return the light (p, F) that arrives at each block from the others, relative to the light a
+    white one reflects.
 
-    Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask covers, `normals`
-    (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
+    Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask
+    covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
     normal_map = np.zeros((*blocks.mask.shape, 3))
     normal_map[blocks.mask] = normals
@@ -223,25 +252,32 @@ def _exchange(blocks: Blocks, covered: Float64Array, normals: Float64Array, sent
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
-    # Add half the side of a block, because neighbours exchange light over their whole area, not only their centres.
+    # Add half the side of a block, because neighbours exchange light over their whole area, not
+    # only their centres.
     square = np.square(towards).sum(axis=-1) + 0.5**2
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
     entering = np.einsum("ijk,ik->ij", towards, facing).clip(min=0)
     area = (covered / normals[:, 2].clip(min=0.15)).astype(np.float32)
-    # The form factor of a small part (Goral et al., "Modeling the interaction of light between diffuse surfaces", 1984)
+    # The form factor of a small part (Goral et al., "Modeling the interaction of light between
+    # diffuse surfaces", 1984)
     factors = leaving * entering * area / (np.pi * np.square(square))
     factors /= factors.sum(axis=1, keepdims=True).clip(min=1)
     return np.asarray(factors @ sent.astype(np.float32))
 
 
 def _exposure(
-    indirect: IndirectLight, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
+    indirect: IndirectLight,
+    observations: Float32Array,
+    lighting_at: LightingAt,
+    normals: Float32Array,
 ) -> float | None:
-    """Return the factor from albedos in the observations' unit to true ones; None without visible indirect light.
+    """Return the factor from albedos in the observations' unit to true ones; None without visible
+    indirect light.
 
-    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
-    under a ring of lights, indirect light is just as uniform, and the fit assigns it to the indirect part.
+    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike.
+    In a round bowl under a ring of lights, indirect light is just as uniform, and the fit assigns
+    it to the indirect part.
     """
     found = []
     step = max(1, len(normals) // 50_000)
@@ -257,13 +293,16 @@ def _exposure(
         return None
     with np.errstate(invalid="ignore"):  # black shadows have no correlation
         correlation = np.corrcoef(seen, gathered)[0, 1]
-    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes, metal.
+    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on
+    # rendered scenes, metal.
     if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
     # If gathered and ambient light are more alike, they cannot be separated.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
-        with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
+        with_ambient, ambient = np.linalg.lstsq(
+            np.stack((gathered, albedo), axis=1), seen, rcond=None
+        )[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
 

@@ -1,13 +1,15 @@
-"""Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows, by cast shadows.
+"""Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows,
+by cast shadows.
 
-The normals that lights give show whether the lights are in the right frame. Lights in a wrong frame fit the images as
-well as correct ones. But normals of a surface have no curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and
-Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn
-1981).
+The normals that lights give show whether the lights are in the right frame. Lights in a wrong frame
+fit the images as well as correct ones. But normals of a surface have no curl (Horn, "Shape from
+shading", 1970; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity", IJCV 1999), and they
+point outwards at the outline of the object (Ikeuchi and Horn 1981).
 
-The shadows that a surface casts on itself distinguish bumps from hollows. Negating x and y of all lights gives the
-normals of the surface with its depth inverted. It has the same shading and the same attached shadows (Belhumeur,
-Kriegman and Yuille, IJCV 1999), but it casts shadows in other places.
+The shadows that a surface casts on itself distinguish bumps from hollows. Negating x and y of all
+lights gives the normals of the surface with its depth inverted. It has the same shading and the
+same attached shadows (Belhumeur, Kriegman and Yuille, IJCV 1999), but it casts shadows in other
+places.
 """
 
 from __future__ import annotations
@@ -20,9 +22,11 @@ from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import fit_robustly, shadow_weights
 
-SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
+# standard deviation in pixels of the smoothing of the normals before they are differentiated
+SMOOTHING = 1.5
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
-STEEP_Z = 0.7  # a rim pixel is considered steep if its normal is at least 45 degrees from the viewing direction
+# a rim pixel is considered steep if its normal is at least 45 degrees from the viewing direction
+STEEP_Z = 0.7
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
 _FITS = 5  # weighted fits to a pixel
 _TURNED_PIXELS = 2000
@@ -34,18 +38,25 @@ class RoughNormals:
 
     normals: Float64Array  # (h, w, 3), unit in the mask, zero outside
     mask: Bools  # (h, w)
-    outward: Float64Array  # (h, w, 2), unit, x right and y up, pointing out of the mask at the rim; zero elsewhere
+    # (h, w, 2), unit, x right and y up, pointing out of the mask at the rim; zero elsewhere
+    outward: Float64Array
 
     @property
     def rim_steepness(self) -> float:
-        """The share of the rim's pixels that are steep. It does not depend on the frame of the lights."""
+        """The share of the rim's pixels that are steep. It does not depend on the frame of the
+        lights.
+        """
         rim = self.outward.any(axis=2)
         return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
 
     def transformed(self, matrix: Float64Array) -> RoughNormals:
-        """Return the normals that the lights would give after a multiplication with a matrix (3, 3)."""
+        """Return the normals that the lights would give after a multiplication with a matrix (3,
+        3).
+        """
         normals = self.normals @ np.linalg.inv(matrix)
-        return RoughNormals(np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward)
+        return RoughNormals(
+            np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward
+        )
 
     def curl(self) -> float:
         """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
@@ -56,10 +67,11 @@ class RoughNormals:
         return float(np.median(np.abs(p_y - q_x)) / max(np.median(size), 1e-12))
 
     def least_curl_deg(self, *, mirrored: bool) -> float:
-        """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the least curl.
+        """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the
+        least curl.
 
-        They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A rotation by 180 degrees
-        more has the same curl. NaN if the mask has too few pixels.
+        They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A
+        rotation by 180 degrees more has the same curl. NaN if the mask has too few pixels.
         """
         if (found := self._derivatives_inside()) is None:
             return float("nan")
@@ -71,8 +83,12 @@ class RoughNormals:
         curls = np.cos(angles) * (p_y - q_x)[::step] - np.sin(angles) * (p_x + q_y)[::step]
         return float(np.median(np.abs(curls), axis=1).argmin() - 90)
 
-    def _derivatives_inside(self) -> tuple[tuple[Float64Array, Float64Array], tuple[Float64Array, Float64Array]] | None:
-        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None for too few."""
+    def _derivatives_inside(
+        self,
+    ) -> tuple[tuple[Float64Array, Float64Array], tuple[Float64Array, Float64Array]] | None:
+        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None
+        for too few.
+        """
         from scipy.ndimage import binary_erosion
 
         z = np.maximum(self.normals[..., 2], _LOWEST_Z)
@@ -83,7 +99,8 @@ class RoughNormals:
         return (p[0][inside], p[1][inside]), (q[0][inside], q[1][inside])
 
     def rim(self) -> float:
-        """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.
+        """Return the mean cosine, in the image, between normals and the outward direction at steep
+        pixels of the rim.
 
         It is 1 for a closed convex outline, 0 if one axis is flipped, and -1 if both are.
         """
@@ -94,23 +111,31 @@ class RoughNormals:
         return float((along * self.outward[steep]).sum(axis=1).mean())
 
 
-def rough_normals(observations: Floats, light_directions: Float64Array, mask: Bools) -> RoughNormals:
+def rough_normals(
+    observations: Floats, light_directions: Float64Array, mask: Bools
+) -> RoughNormals:
     """Return smoothed normals of a fit of least absolute deviations.
 
     Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
     """
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
-    return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)
+    return smooth_normals(
+        fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask
+    )
 
 
 def median_turn_deg(
-    observations: Floats, lights: Float64Array, other_lights: Float64Array, other_observations: Floats | None = None
+    observations: Floats,
+    lights: Float64Array,
+    other_lights: Float64Array,
+    other_observations: Floats | None = None,
 ) -> float:
     """Return the median angle in degrees between the normals that two readings of a capture give.
 
-    It is the error of the first reading if the second is right. Each is a robust fit of observations (P, F) under
-    lights (F, 3) or (P, F, 3); None for the observations of the first reading.
+    It is the error of the first reading if the second is right. Each is a robust fit of
+    observations (P, F) under lights (F, 3) or (P, F, 3); None for the observations of the first
+    reading.
     """
     others = observations if other_observations is None else other_observations
     step = max(1, len(observations) // _TURNED_PIXELS)
@@ -124,7 +149,9 @@ def median_turn_deg(
 
 
 def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
-    """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H, W)."""
+    """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H,
+    W).
+    """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     normals = np.zeros((*mask.shape, 3))
@@ -141,7 +168,9 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
 
 
 def outward_directions(mask: Bools, sigma: float) -> Float64Array:
-    """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels falls; else zero."""
+    """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels
+    falls; else zero.
+    """
     from scipy.ndimage import gaussian_filter
 
     return unit(-np.stack(_derivatives(gaussian_filter(mask.astype(np.float64), sigma)), axis=2))
@@ -150,18 +179,23 @@ def outward_directions(mask: Bools, sigma: float) -> Float64Array:
 def _derivatives(values: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the derivatives to the right and upwards; zero along a side of one pixel."""
     downwards, right = (
-        np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)
+        np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values)
+        for axis in (0, 1)
     )
     return np.asarray(right), np.asarray(-downwards)
 
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
-"""Lights are doubted if more than the first share of the lit observations should be in cast shadow but are not, and the
-other reading has less than the second number times this share."""
+"""Lights are doubted if more than the first share of the lit observations should be in cast shadow
+but are not, and the other reading has less than the second number times this share."""
 
 
 _MAX_PIXELS = 6000
-_LIT_SHARE, _DARK_SHARE = 0.25, 0.4  # of a pixel's brightest shading, and of its own, beyond which shadows are judged
+# of a pixel's brightest shading, and of its own, beyond which shadows are judged
+_LIT_SHARE, _DARK_SHARE = (
+    0.25,
+    0.4,
+)
 _MARGIN = 0.5  # pixels that a surface must rise above a ray
 
 
@@ -173,10 +207,12 @@ class Shadows:
     missing: float  # share of the lit observations that should be in cast shadow, but are bright
 
     def evidence(self, other: Shadows) -> float:
-        """Return the evidence for another reading against this one, as an advantage of light_check.py."""
-        # Weight of a difference of agreements, relative to the weights in light_check.py. Synthetic bumps agree by 0.2
-        # to 0.9 with correct lights, below 0.02 with negated ones; photographs of statues by 0.07 to 0.3, and below
-        # 0.01.
+        """Return the evidence for another reading against this one, as an advantage of
+        light_check.py.
+        """
+        # Weight of a difference of agreements, relative to the weights in light_check.py. Synthetic
+        # bumps agree by 0.2 to 0.9 with correct lights, below 0.02 with negated ones; photographs
+        # of statues by 0.07 to 0.3, and below 0.01.
         found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
             return found + 1
@@ -185,15 +221,20 @@ class Shadows:
         return found
 
     def leaves_open(self, other: Shadows) -> bool:
-        """Return whether this reading predicts shadows that are missing, more than another one does."""
-        # The same shares, from which lights may be wrong. If both readings lack about as many shadows, the images
-        # were rendered without cast shadows, which is not evidence against the lights.
+        """Return whether this reading predicts shadows that are missing, more than another one
+        does.
+        """
+        # The same shares, from which lights may be wrong. If both readings lack about as many
+        # shadows, the images were rendered without cast shadows, which is not evidence against the
+        # lights.
         return self.missing > 0.01 and other.missing < 0.75 * self.missing
 
 
 @dataclass(frozen=True, eq=False)
 class ShadowCheck:
-    """Dark observations of a sample, to be compared with the shadows of its surfaces under its lights."""
+    """Dark observations of a sample, to be compared with the shadows of its surfaces under its
+    lights.
+    """
 
     normals: RoughNormals  # on a coarser grid
     lights: Float64Array  # (f, 3)
@@ -202,13 +243,16 @@ class ShadowCheck:
 
     @classmethod
     def of(cls, observations: Floats, lights: Float64Array, normals: RoughNormals) -> ShadowCheck:
-        """Return the check of observations (P, F) under lights (F, 3), with the smoothed normals that these give."""
+        """Return the check of observations (P, F) under lights (F, 3), with the smoothed normals
+        that these give.
+        """
         step = max(1, int(np.ceil(np.sqrt(len(observations) / _MAX_PIXELS))))
         part = slice(None, None, step), slice(None, None, step)
         rows = np.zeros(normals.mask.shape, np.intp)
         rows[normals.mask] = np.arange(len(observations))
         known = normals.normals[part].any(axis=2, keepdims=True)
-        facing = np.where(known, normals.normals[part], (0.0, 0.0, 1.0))  # pixels amid black ones have no normal
+        # pixels amid black ones have no normal
+        facing = np.where(known, normals.normals[part], (0.0, 0.0, 1.0))
         coarse = RoughNormals(facing, normals.mask[part], normals.outward[part])
         chosen = np.linspace(0, len(lights) - 1, min(len(lights), 24)).astype(int)
         values = observations[rows[part][coarse.mask]].astype(np.float64)
@@ -236,20 +280,29 @@ class ShadowCheck:
 
 
 def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
-    """Return where a surface shades itself (h, w, F), from heights (h, w) in pixels, NaN outside the object."""
+    """Return where a surface shades itself (h, w, F), from heights (h, w) in pixels, NaN outside
+    the object.
+    """
     height, width = heights.shape
     relief = float(np.nanmax(heights) - np.nanmin(heights))
     padded = np.full((3 * height, 3 * width), -np.inf)
-    padded[height : 2 * height, width : 2 * width] = np.where(np.isfinite(heights), heights, -np.inf)
+    padded[height : 2 * height, width : 2 * width] = np.where(
+        np.isfinite(heights), heights, -np.inf
+    )
     surface = np.where(np.isfinite(heights), heights, np.inf)
     cast = np.zeros((height, width, len(lights)), np.bool_)
     for place, (x, y, z) in enumerate(lights):
         level = float(np.hypot(x, y))
         # A ray that has climbed by the whole relief cannot be blocked any more.
-        longest = max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
+        longest = (
+            max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
+        )
         for step in range(2, longest if level > 0 else 0):
             down, right = round(-y / level * step), round(x / level * step)
             if abs(down) < height and abs(right) < width:
-                rows, columns = slice(height + down, 2 * height + down), slice(width + right, 2 * width + right)
+                rows, columns = (
+                    slice(height + down, 2 * height + down),
+                    slice(width + right, 2 * width + right),
+                )
                 cast[..., place] |= padded[rows, columns] > surface + z / level * step + _MARGIN
     return cast

@@ -1,19 +1,22 @@
-"""Lights from the images of the object alone (uncalibrated photometric stereo), and how to resolve the ambiguities.
+"""Lights from the images of the object alone (uncalibrated photometric stereo), and how to resolve
+the ambiguities.
 
-The shading of a matte surface leaves its lights ambiguous, so other evidence has to decide. A bump looks like a hollow
-under lights with x and y negated: shading, attached shadows and highlights are equal, and so is the curl of the
-normals. Cast shadows and the outline differ. In addition, the heights of a surface may be scaled if its lights are
-lowered or raised with them. This generalised bas-relief ambiguity keeps all shadows (Belhumeur, Kriegman and Yuille,
-"The bas-relief ambiguity", IJCV 1999), but the albedo then changes with the slope.
+The shading of a matte surface leaves its lights ambiguous, so other evidence has to decide. A bump
+looks like a hollow under lights with x and y negated: shading, attached shadows and highlights are
+equal, and so is the curl of the normals. Cast shadows and the outline differ. In addition, the
+heights of a surface may be scaled if its lights are lowered or raised with them. This generalised
+bas-relief ambiguity keeps all shadows (Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity",
+IJCV 1999), but the albedo then changes with the slope.
 
-The outline of the object shows a common rotation of lights and normals. Where a smooth surface curves away from the
-camera, its normals are perpendicular to the view and to the outline. A rotation of all lights rotates all normals with
-them, including the normals at the outline.
+The outline of the object shows a common rotation of lights and normals. Where a smooth surface
+curves away from the camera, its normals are perpendicular to the view and to the outline. A
+rotation of all lights rotates all normals with them, including the normals at the outline.
 
-The light network guesses each light from shading, shadows and outline, and predicts the error of its guess. The images
-then refine these guesses: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights
-are moved together until such a surface explains the images, within the predicted errors. Cast shadows, the outline and
-the albedo resolve the remaining ambiguities.
+The light network guesses each light from shading, shadows and outline, and predicts the error of
+its guess. The images then refine these guesses: a matte surface under F lights has images of rank 3
+(Hayakawa, JOSA A 1994), so the lights are moved together until such a surface explains the images,
+within the predicted errors. Cast shadows, the outline and the albedo resolve the remaining
+ambiguities.
 """
 
 import math
@@ -25,7 +28,13 @@ import torch
 from splinecli.capture.record import FoundLights, azimuth_of
 from splinecli.errors import InputError
 from splinecli.lights.light_fit import INTENSITY_ERROR, fit_near
-from splinecli.lights.light_net import LightGuess, LightNet, light_net, network_inputs, square_images
+from splinecli.lights.light_net import (
+    LightGuess,
+    LightNet,
+    light_net,
+    network_inputs,
+    square_images,
+)
 from splinecli.lights.rough_normals import cast_shadows, outward_directions, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
@@ -37,15 +46,16 @@ from splinecli.system.machine import side_by_side
 _FITS = 5
 _LEAST_Z = 0.1  # of normals that are integrated
 _DARK_SHARE = 0.02  # of the brightest hundredth
-_LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)  # logarithms of the factors of the heights of the lights that are tried
+# logarithms of the factors of the heights of the lights that are tried
+_LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)
 _ALBEDO_BINS = 41  # of 0.1, of the logarithm of the albedo
 
 
 def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> float:
     """Return the log odds that the lights are right against that their x and y are negated.
 
-    The observations (P, F) are linear, divided by the light intensities. The mask (H, W) has P true pixels, in
-    row-major order, and the directions (F, 3) are unit.
+    The observations (P, F) are linear, divided by the light intensities. The mask (H, W) has P true
+    pixels, in row-major order, and the directions (F, 3) are unit.
     """
     blocks = Blocks.over(mask, 1200)
     values, mask = blocks.average(observations, mask).astype(np.float64), blocks.mask
@@ -66,10 +76,13 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
     facing = bright & (predicted > 0.15)
     dark = values[facing] < 0.5 * predicted[facing]
     bump, hollow = (
-        _correlation(cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark)
+        _correlation(
+            cast_shadows(sign * heights, light_directions * (sign, sign, 1))[mask][facing], dark
+        )
         for sign in (1, -1)
     )
-    # Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions, or 3 % without outline.
+    # Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions, or 3
+    # % without outline.
     return 11.0 * (bump - hollow) + 8.0 * outline
 
 
@@ -80,12 +93,16 @@ def _correlation(predicted: Bools, seen: Bools) -> float:
     return float(np.corrcoef(predicted, seen)[0, 1])
 
 
-def lower_lights(observations: Float32Array, light_directions: Float64Array, error_deg: float) -> Float64Array:
-    """Return low lights (F, 3), lowered together towards those under which the albedo has few values; others as given.
+def lower_lights(
+    observations: Float32Array, light_directions: Float64Array, error_deg: float
+) -> Float64Array:
+    """Return low lights (F, 3), lowered together towards those under which the albedo has few
+    values; others as given.
 
-    The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity
-    by entropy minimization", CVPR 2007). Lights are only lowered, as the network's errors are upwards. The
-    observations (P, F) are linear, divided by the light intensities; `error_deg` is the mean expected error.
+    The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized
+    bas-relief ambiguity by entropy minimization", CVPR 2007). Lights are only lowered, as the
+    network's errors are upwards. The observations (P, F) are linear, divided by the light
+    intensities; `error_deg` is the mean expected error.
     """
     # The network finds lower lights too high.
     if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
@@ -97,13 +114,16 @@ def lower_lights(observations: Float32Array, light_directions: Float64Array, err
     scaled = (scaled * observations[chosen].max(axis=1)[:, None])[known]
     if len(scaled) < _ALBEDO_BINS:
         return light_directions
-    prior = 49.0 / error_deg**2  # entropy per square of this logarithm and of the expected error in degrees
+    # entropy per square of this logarithm and of the expected error in degrees
+    prior = 49.0 / error_deg**2
     costs = [_entropy(scaled / (1, 1, np.exp(log))) + prior * log**2 for log in _LOG_HEIGHTS]
     return np.asarray(unit(light_directions * (1, 1, np.exp(_LOG_HEIGHTS[int(np.argmin(costs))]))))
 
 
 def _entropy(scaled_normals: Float64Array) -> float:
-    """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their median."""
+    """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their
+    median.
+    """
     albedo = np.log(np.linalg.norm(scaled_normals, axis=1))
     places = np.rint((albedo - np.median(albedo)) / 0.1) + _ALBEDO_BINS // 2
     counts = np.bincount(places.clip(0, _ALBEDO_BINS - 1).astype(int), minlength=_ALBEDO_BINS)
@@ -130,8 +150,11 @@ class OutlineTurn(NamedTuple):
         return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
 
 
-def turn_at_outline(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows, or None. The border of the image is ignored.
+def turn_at_outline(
+    observations: Float32Array, mask: Bools, light_directions: Float64Array
+) -> OutlineTurn | None:
+    """Return the rotation of the lights that the outline shows, or None. The border of the image is
+    ignored.
 
     See bump_log_odds for the arguments.
     """
@@ -144,8 +167,9 @@ def turn_at_outline(observations: Float32Array, mask: Bools, light_directions: F
     turn = Rotation.identity()
     for _ in range(25):
         turned = turn.apply(normals)
-        # A small rotation w adds w x n. The first residual is along the view axis, the second along the outline.
-        # Normals within a pixel of the outline have a z of about 0.25, because pixels have a size and masks end inside.
+        # A small rotation w adds w x n. The first residual is along the view axis, the second along
+        # the outline. Normals within a pixel of the outline have a z of about 0.25, because pixels
+        # have a size and masks end inside.
         residuals = np.stack((turned[:, 2] - 0.25, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
         weights = 1 / (np.abs(residuals) + 0.1)
@@ -158,7 +182,9 @@ def turn_at_outline(observations: Float32Array, mask: Bools, light_directions: F
 
 
 def outline_share(mask: Bools) -> float:
-    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of the image."""
+    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of
+    the image.
+    """
     boundary = _boundary(mask)
     # Masks of objects that fill the image may leave out a border of this share of its sides
     rows, columns = (1 + round(0.01 * side) for side in mask.shape)
@@ -174,11 +200,16 @@ def _boundary(mask: Bools) -> Bools:
     return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
 
 
-def _rim(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
+def _rim(
+    observations: Float32Array, mask: Bools, light_directions: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards,
+    with z = 0.
+    """
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
-    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards.
+    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered
+    # mask falls outwards.
     width = max(1.5, 0.02 * float(np.sqrt(np.count_nonzero(mask))))
     outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
     values = observations[rim[mask]].astype(np.float64)
@@ -193,7 +224,8 @@ def _rim(observations: Float32Array, mask: Bools, light_directions: Float64Array
     return unit(fitted), outwards[seen]
 
 
-LARGEST_ERROR_DEG = 20.0  # mean expected error of lights; larger ones are refused, as their normals would be useless
+# mean expected error of lights; larger ones are refused, as their normals would be useless
+LARGEST_ERROR_DEG = 20.0
 _MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 
@@ -208,13 +240,14 @@ def find_lights(
 ) -> FoundLights:
     """Find the lights of the images of one object.
 
-    The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are known; else these
-    are found, too. The mask (H, W) has P true pixels, in row-major order. `first_light` is where the light of the first
-    observations comes from, see azimuth_of; it decides between a bump and a hollow. Without it, shadows and the outline
-    decide. If the images do not determine the lights, an error is raised, or without `refuse` a guess is returned.
+    The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are
+    known; else these are found, too. The mask (H, W) has P true pixels, in row-major order.
+    `first_light` is where the light of the first observations comes from, see azimuth_of; it
+    decides between a bump and a hollow. Without it, shadows and the outline decide. If the images
+    do not determine the lights, an error is raised, or without `refuse` a guess is returned.
 
-    Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the images are all alike,
-    do not show one surface, or do not determine the lights.
+    Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the
+    images are all alike, do not show one surface, or do not determine the lights.
     """
     step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
     if step > 1:
@@ -222,14 +255,17 @@ def find_lights(
         grid[::step, ::step] = mask[::step, ::step]
         observations, mask = observations[grid[mask]], mask[::step, ::step]
     _check_different(observations)
-    # Smallest share of the mask's boundary inside the image. With less, the object extends beyond the image.
+    # Smallest share of the mask's boundary inside the image. With less, the object extends beyond
+    # the image.
     outlined = outline_share(mask) >= 0.5
     if refuse and first_light is None and not outlined:
         remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
         raise InputError(
-            "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
+            "the images do not show the outline of the object, so a bump looks like"
+            " a hollow under opposite lights",
             hint=f"If the images show the whole object, {remedy}. Else say where the light of"
-            " the first image that is used comes from: --first-light left, upper-left, or its azimuth in degrees,"
+            " the first image that is used comes from: --first-light left, upper-left,"
+            " or its azimuth in degrees,"
             " counter-clockwise from the right",
         )
     directions, errors_deg, intensities = _ask_network(observations, mask)
@@ -239,10 +275,13 @@ def find_lights(
         observations = np.asarray(observations / intensities, np.float32)
     error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=6.0)
-    # Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes,
-    # including metals, reach at most half of this value.
+    # Largest median residual of a matte surface, as a share of a pixel's brightest observation.
+    # Rendered scenes, including metals, reach at most half of this value.
     if refuse and fit is not None and fit.after > 0.08:
-        problem = "the images do not show one surface under different distant lights, so the lights cannot be found"
+        problem = (
+            "the images do not show one surface under different distant lights, so"
+            " the lights cannot be found"
+        )
         hint = "Check that camera and object stood still, and that all images show the same object"
         raise InputError(problem, hint=hint)
     if fit is not None and fit.after < fit.before and (fit.directions[:, 2] > 0).all():
@@ -251,44 +290,58 @@ def find_lights(
     expected_deg, opposite_share = float(errors_deg.mean()), 0.0
     if first_light is None:
         log_odds = bump_log_odds(observations, mask, directions)
-        # The network seldom confuses bumps with hollows, but more often if it expects larger errors.
+        # The network seldom confuses bumps with hollows, but more often if it expects larger
+        # errors.
         log_odds += max(1.0, 7.0 - 0.25 * expected_deg)
         directions = directions * (-1, -1, 1) if log_odds < 0 else directions
         opposite_share = 1 / (1 + math.exp(abs(log_odds)))
     turn = turn_at_outline(observations, mask, directions)
     if turn is not None and turn.spread < 0.2:  # outlines of larger spread are ignored
-        # The part of a larger rotation beyond twice the expected error comes from the mouth of a vessel.
-        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))  # of the rotation that it shows
+        # The part of a larger rotation beyond twice the expected error comes from the mouth of a
+        # vessel.
+        # of the rotation that it shows
+        share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     directions = lower_lights(observations, directions, expected_deg)
-    # Mean error of these lights, from the error that the network expects, fitted on 720 rendered captures: it expects
-    # too much of easy objects. The 1.2 degrees are for photographs.
+    # Mean error of these lights, from the error that the network expects, fitted on 720 rendered
+    # captures: it expects too much of easy objects. The 1.2 degrees are for photographs.
     found_deg = 0.39 * expected_deg**1.3 if outlined else 0.65 * expected_deg
     errors_deg = errors_deg * math.hypot(found_deg, 1.2) / expected_deg
     opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
-            f"the images do not determine the lights: their estimated error is {expected:.0f} degrees, expected at most"
+            "the images do not determine the lights: their estimated error is"
+            f" {expected:.0f} degrees, expected at most"
             f" {LARGEST_ERROR_DEG:.0f}",
-            hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
+            hint="Show the whole outline of the object and give its mask, add images with"
+            " other lights, or measure the"
             " lights with 'splinecli calibrate'",
         )
-    return FoundLights(directions, errors_deg, None if intensities_known else intensities / intensities.mean())
+    return FoundLights(
+        directions, errors_deg, None if intensities_known else intensities / intensities.mean()
+    )
 
 
 def _towards(directions: Float64Array, first_light: str) -> Float64Array:
-    """Return the directions (F, 3), or those with opposite x and y, whichever has the first light on this side.
+    """Return the directions (F, 3), or those with opposite x and y, whichever has the first light
+    on this side.
 
     Raises InputError if it is not clearly on either side.
     """
     azimuth = math.radians(azimuth_of(first_light))
     towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
-    # Smallest share of a direction towards a side from which a light comes: 9 degrees from the camera axis.
+    # Smallest share of a direction towards a side from which a light comes: 9 degrees from the
+    # camera axis.
     if abs(towards) < 0.15:
-        problem = f"the first light does not come clearly from {first_light}, nor from the opposite side"
-        hint = "Give its azimuth in degrees, as --first-light 45, or put an image with a light from a side first"
+        problem = (
+            f"the first light does not come clearly from {first_light}, nor from the opposite side"
+        )
+        hint = (
+            "Give its azimuth in degrees, as --first-light 45, or put an image with"
+            " a light from a side first"
+        )
         raise InputError(problem, hint=hint)
     return directions * (-1, -1, 1) if towards < 0 else directions
 
@@ -296,15 +349,20 @@ def _towards(directions: Float64Array, first_light: str) -> Float64Array:
 def _check_different(observations: Float32Array) -> None:
     """Raise InputError if the light does not change between the images."""
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
-    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is not a change of the light
+    # a change of exposure is not a change of the light
+    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)
     mean = rows.mean(axis=1, keepdims=True)
     # Images that differ by less from their mean do not show a moving light.
     if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
         problem = "all images are alike, so they say nothing about the lights"
-        raise InputError(problem, hint="Photograph the object with the lamp at a different place for each image")
+        raise InputError(
+            problem, hint="Photograph the object with the lamp at a different place for each image"
+        )
 
 
-def _ask_network(observations: Float32Array, mask: Bools) -> tuple[Float64Array, Float64Array, Float64Array]:
+def _ask_network(
+    observations: Float32Array, mask: Bools
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
 
     They are means over the four rotations of the images by 90 degrees and their mirror images.
@@ -317,23 +375,34 @@ def _ask_network(observations: Float32Array, mask: Bools) -> tuple[Float64Array,
         small.append(cut[0])
     if not inside.any():
         raise InputError(
-            "the mask is too thin or too scattered to find the lights", hint="Give a mask of the whole object"
+            "the mask is too thin or too scattered to find the lights",
+            hint="Give a mask of the whole object",
         )
     images = torch.stack(small)
     images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
     network = light_net()
     # One thread each, so that the number of threads does not change the rounding.
     guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
-    directions, sharpness, log_intensities = (torch.cat(part).double() for part in zip(*guesses, strict=True))
+    directions, sharpness, log_intensities = (
+        torch.cat(part).double() for part in zip(*guesses, strict=True)
+    )
     towards = (sharpness.exp()[..., None] * directions).sum(dim=0)
     mean = torch.nn.functional.normalize(towards, dim=-1)
     between = (directions * mean).sum(dim=-1).clamp(-1, 1).acos().square().mean(dim=0)
     own = (math.pi / 2 / sharpness.exp()).mean(dim=0)  # mean square errors of normal distributions
-    return mean.numpy(), (own + between).sqrt().rad2deg().numpy(), log_intensities.mean(dim=0).exp().numpy()
+    return (
+        mean.numpy(),
+        (own + between).sqrt().rad2deg().numpy(),
+        log_intensities.mean(dim=0).exp().numpy(),
+    )
 
 
-def _view(network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool) -> LightGuess:
-    """Return the network's guess for rotated, then mirrored images, in the frame of the images as they are."""
+def _view(
+    network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool
+) -> LightGuess:
+    """Return the network's guess for rotated, then mirrored images, in the frame of the images as
+    they are.
+    """
     images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
     if mirrored:
         images, inside = images.flip(2), inside.flip(1)

@@ -1,1 +1,3 @@
-"""Base colour, roughness, metalness and specular reflection of each pixel, from images, lights and normals."""
+"""Base colour, roughness, metalness and specular reflection of each pixel, from images, lights and
+normals.
+"""

@@ -13,14 +13,16 @@ from splinecli.materials.material_net import Gloss, material_networks
 from splinecli.maths import Bools, Float32Array
 from splinecli.system.machine import one_thread_each, side_by_side
 
-_MOST_PIXELS = 60_000  # in larger captures, the net is applied to every second, third, ... row and column
+# in larger captures, the net is applied to every second, third, ... row and column
+_MOST_PIXELS = 60_000
 _BATCH = 1024
 _UNKNOWN_ERROR = 10.0  # of the roughness of a black pixel
 _SMOOTH = 2.0  # pixels: standard deviation of the mean over neighbours
 
 
 def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
-    """Estimate the gloss of the P pixels of a mask (H, W), with `log_level` in the unit of the observations.
+    """Estimate the gloss of the P pixels of a mask (H, W), with `log_level` in the unit of the
+    observations.
 
     Raises ModelError if the weights are damaged.
     """
@@ -65,12 +67,16 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
     for values in found:
         usual = np.float32(np.average(values, weights=weights))
         sums = blurred_from_chosen(weights * values)
-        smooth.append(torch.from_numpy(np.divide(sums, total, out=np.full_like(total, usual), where=reached)))
+        smooth.append(
+            torch.from_numpy(np.divide(sums, total, out=np.full_like(total, usual), where=reached))
+        )
     return Gloss(*smooth)
 
 
 def blurred(values: Float32Array, mask: Bools, deviation: float) -> Float32Array:
-    """Return a Gaussian blur of values (P,) on the pixels of a mask (H, W), outside of which they are zero."""
+    """Return a Gaussian blur of values (P,) on the pixels of a mask (H, W), outside of which they
+    are zero.
+    """
     from cv2 import GaussianBlur
 
     plane = np.zeros(mask.shape, np.float32)

@@ -1,4 +1,6 @@
-"""Maps of a capture's material, from its images, lights and normals, and pictures of it under other lights."""
+"""Maps of a capture's material, from its images, lights and normals, and pictures of it under other
+lights.
+"""
 
 from __future__ import annotations
 
@@ -33,33 +35,40 @@ from splinecli.surface.integration import integrate_normals
 _LIT = 0.05  # n.l from which a light is used; the rounded rim of a shadow is below
 _BRIGHT_QUANTILE = 0.95
 _SMOOTH = 4.0  # pixels: standard deviation of the mean over which the trust is decided
-_DIELECTRIC = 0.04  # mean reflectance of dielectrics at normal incidence, which determines the exposure
+# mean reflectance of dielectrics at normal incidence, which determines the exposure
+_DIELECTRIC = 0.04
 _WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
 _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _SURE = 0.1  # the error of a roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
-_FLOOR, _FLAT = 0.005, 0.12  # of the bright pixels' albedo and the mean observation: errors of all observations
+# of the bright pixels' albedo and the mean observation: errors of all observations
+_FLOOR, _FLAT = (
+    0.005,
+    0.12,
+)
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence
 _LEAST_ERROR, _MOST_ERROR = 0.015, 0.25  # radians
 _CONFIDENT = np.radians(5)  # the error that the confidence of a normal refers to
-_MOST_CELLS = 40_000  # shadows of larger maps are computed for every second, third, ... row and column
+# shadows of larger maps are computed for every second, third, ... row and column
+_MOST_CELLS = 40_000
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialMaps:
-    """The material of the P pixels of a mask, in glTF's parameters, and further values for pictures.
+    """The material of the P pixels of a mask, in glTF's parameters, and further values for
+    pictures.
 
-    base_colour: (P, 3) linear RGB; all channels are equal for gray images. The exposure of photographs is unknown, so
-        the scale is chosen such that dielectrics reflect 4 % on average, but never so that the brightest bases exceed
-        white.
+    base_colour: (P, 3) linear RGB; all channels are equal for gray images. The exposure of
+        photographs is unknown, so the scale is chosen such that dielectrics reflect 4 % on average,
+        but never so that the brightest bases exceed white.
     roughness, metalness, specular: (P,), Burley's parameters. `specular` may exceed 1.
     confidence: (P,), the probability that the roughness is wrong by at most 0.1.
-    minnaert, tail: (P,), exponents of the diffuse light and of the facets' distribution, which glTF does not have.
-    matte: (P,), the reflectance of a matte surface that fits best, in the unit of the observations.
-    trust: (P,), the share of the material in pictures; the rest is matte. It is chosen by how well each predicts
-        observations that are left out.
+    minnaert, tail: (P,), exponents of the diffuse light and of the facets' distribution, which glTF
+    does not have. matte: (P,), the reflectance of a matte surface that fits best, in the unit of
+    the observations. trust: (P,), the share of the material in pictures; the rest is matte. It is
+        chosen by how well each predicts observations that are left out.
     white: the brightest observation of pictures.
     exposure: the observation of a matte white surface that faces the light.
     """
@@ -93,9 +102,10 @@ def estimate_material(
         normals: (P, 3) unit, in the capture's frame.
         lights: (F, 3) unit, at the middle of the object; they determine the shadows.
         lighting_at: returns observations and light directions of some pixels.
-        normal_confidence: (P,), the probability that a normal is off by at most 5 degrees. None if it is unknown.
-        colours: for each light, the linear RGB values (P, 3) whose channels have the observations as their mean; None
-            for gray images.
+        normal_confidence: (P,), the probability that a normal is off by at most 5 degrees. None if
+            it is unknown.
+        colours: for each light, the linear RGB values (P, 3) whose channels have the observations
+            as their mean; None for gray images.
 
     Raises:
         InputError: there are too few lights.
@@ -104,7 +114,10 @@ def estimate_material(
     normal_map = np.zeros((*mask.shape, 3), np.float32)
     normal_map[mask] = normals
     pixels = _Pixels(
-        normals, _normal_error(normals, normal_confidence), lights_that_reach(normal_map, mask, lights), lighting_at
+        normals,
+        _normal_error(normals, normal_confidence),
+        lights_that_reach(normal_map, mask, lights),
+        lighting_at,
     )
     bright, white = pixels.brightness()
     gloss = estimate_gloss(mask, lighting_at)
@@ -141,7 +154,8 @@ def render_gray(
     reached: Bools,
     normal_confidence: Float32Array | None = None,
 ) -> Float32Array:
-    """Return the observations (P, F) of a material under distant lights (F, 3), in the unit of its own observations.
+    """Return the observations (P, F) of a material under distant lights (F, 3), in the unit of its
+    own observations.
 
     Args:
         normals, normal_confidence: as for estimate_material.
@@ -155,10 +169,14 @@ def render_gray(
         def column(values: Float32Array, chosen: PixelIndices = chosen) -> Tensor:
             return float_tensors(values[chosen])[0][:, None]
 
-        geometry = Geometry.of(torch.from_numpy(normals[chosen]), directions, torch.from_numpy(error[chosen]))
+        geometry = Geometry.of(
+            torch.from_numpy(normals[chosen]), directions, torch.from_numpy(error[chosen])
+        )
         facets = facet_lobe(geometry, column(found.roughness), column(found.tail))
         metalness, base = column(found.metalness), column(found.base_colour.mean(axis=1))
-        radiance = base * torch.lerp(diffuse_lobe(geometry, column(found.minnaert)), facets, metalness)
+        radiance = base * torch.lerp(
+            diffuse_lobe(geometry, column(found.minnaert)), facets, metalness
+        )
         radiance = radiance + F0_OF_SPECULAR * column(found.specular) * (1 - metalness) * facets
         matte = column(found.matte) * geometry.n_dot_l.clamp(min=0)
         shiny = (found.exposure * radiance).clamp(max=found.white)
@@ -167,7 +185,8 @@ def render_gray(
 
 
 def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
-    """Return which distant lights (F, 3) reach the P pixels of the mask (H, W): (P, F), without attached shadows.
+    """Return which distant lights (F, 3) reach the P pixels of the mask (H, W): (P, F), without
+    attached shadows.
 
     The shadows are cast by the surface of the normals (H, W, 3), for an orthographic camera.
     """
@@ -182,7 +201,9 @@ def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
 
 
 def _normal_error(normals: Float32Array, confidence: Float32Array | None) -> Float32Array:
-    """Return the expected errors (P,) of normals along each axis, in radians, as if they had a normal distribution."""
+    """Return the expected errors (P,) of normals along each axis, in radians, as if they had a
+    normal distribution.
+    """
     if confidence is None:
         return np.full(len(normals), _NORMAL_ERROR, np.float32)
     error = _CONFIDENT / np.sqrt(-2 * np.log1p(-confidence.clip(0.01, 0.999)))
@@ -199,10 +220,17 @@ class _Pixels:
     lighting_at: LightingAt
 
     def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> Sample:
-        """Return some of the pixels as the fits need them; `bright` is the albedo of bright pixels."""
+        """Return some of the pixels as the fits need them; `bright` is the albedo of bright
+        pixels.
+        """
         light: PixelLighting = self.lighting_at(chosen)
-        normals, normal_error = light.in_frame_of_pixels(self.normals[chosen]), self.normal_error[chosen]
-        observations, directions, *own = float_tensors(light.observations, light.directions, normals, normal_error)
+        normals, normal_error = (
+            light.in_frame_of_pixels(self.normals[chosen]),
+            self.normal_error[chosen],
+        )
+        observations, directions, *own = float_tensors(
+            light.observations, light.directions, normals, normal_error
+        )
         geometry = Geometry.of(own[0], directions, own[1])
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
         floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
@@ -214,41 +242,55 @@ class _Pixels:
         for chosen in parts_of_pixels(len(self.normals), step=max(1, len(self.normals) // 50_000)):
             sample = self.take(chosen, 0.0)
             cosines = sample.geometry.n_dot_l
-            albedo = torch.where(cosines > 2 * _LIT, sample.observations / cosines.clamp(min=2 * _LIT), torch.nan)
+            albedo = torch.where(
+                cosines > 2 * _LIT, sample.observations / cosines.clamp(min=2 * _LIT), torch.nan
+            )
             albedos.append(albedo.nanmedian(1).values.nan_to_num())
             whites.append(np.quantile(sample.observations.numpy(), _WHITE))
-        return max(float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE)), 1e-12), float(np.mean(whites))
+        return max(float(np.quantile(torch.cat(albedos).numpy(), _BRIGHT_QUANTILE)), 1e-12), float(
+            np.mean(whites)
+        )
 
 
 def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
     """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
-    The columns are base, the contribution of white highlights to the weighted observations, which is not part of the
-    base, and the results of _compare.
+    The columns are base, the contribution of white highlights to the weighted observations, which
+    is not part of the base, and the results of _compare.
     """
 
     def column(values: Tensor) -> Tensor:
         return values[chosen][:, None]
 
-    geometry, roughness, metalness = sample.geometry, column(gloss.roughness), column(gloss.metalness)
+    geometry, roughness, metalness = (
+        sample.geometry,
+        column(gloss.roughness),
+        column(gloss.metalness),
+    )
     facets = facet_lobe(geometry, roughness, column(gloss.tail))
     of_facets = metalness * facets
     slope = (1 - metalness) * diffuse_lobe(geometry, column(gloss.minnaert)) + of_facets
     offset = column(gloss.log_level).exp() * (1 - metalness) * facets
     usual = column(gloss.log_base).exp() * sample.observations.amax(1, keepdim=True)
     expected = Base(usual, _LAPLACE * column(gloss.log_base_error) * usual)
-    base, weights = fit_base(sample, slope, offset, of_facets, lobe_error(geometry, roughness), expected)
+    base, weights = fit_base(
+        sample, slope, offset, of_facets, lobe_error(geometry, roughness), expected
+    )
     compared = _compare(sample, slope, offset, weights)
     weights = weights * slope / (weights * slope**2).sum(1, keepdim=True).clamp(min=1e-12)
     pixels = torch.stack((base[:, 0], (weights * offset).sum(1), *compared), dim=1)
     return pixels.numpy(), weights.numpy()
 
 
-def _compare(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a matte surface's reflectance (P,) and the two sums (P,) that determine how much of the material to trust.
+def _compare(
+    sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a matte surface's reflectance (P,) and the two sums (P,) that determine how much of
+    the material to trust.
 
-    Each observation is predicted from the others, by the material and by the matte surface, with the weights of the
-    robust fits. The share of the material that minimises the squared error is the ratio of the two sums.
+    Each observation is predicted from the others, by the material and by the matte surface, with
+    the weights of the robust fits. The share of the material that minimises the squared error is
+    the ratio of the two sums.
     """
     cosine = sample.geometry.n_dot_l.clamp(min=0)
     base, matte_weights = fit_base(sample, cosine, 0 * cosine, 0 * cosine, torch.zeros(1, 1))
@@ -263,7 +305,9 @@ def _smooth(values: Float32Array, mask: Bools) -> Float32Array:
     return blurred(values, mask, _SMOOTH) / blurred(np.ones_like(values), mask, _SMOOTH)
 
 
-def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float32Array) -> Float32Array:
+def _tint(
+    colours: Iterable[Float32Array], weights: Float32Array, offset: Float32Array
+) -> Float32Array:
     """Return the colours (P, 3) of the bases relative to gray: their mean over the channels is 1.
 
     The highlights of dielectrics are white: every channel has the offset (P,) of the gray image.
@@ -277,9 +321,13 @@ def _tint(colours: Iterable[Float32Array], weights: Float32Array, offset: Float3
 
 
 def _exposure(base: Float32Array, gloss: Gloss) -> float:
-    """Return the exposure at which dielectrics reflect as they usually do and no base exceeds white."""
+    """Return the exposure at which dielectrics reflect as they usually do and no base exceeds
+    white.
+    """
     white = max(float(np.quantile(base.max(axis=1), _WHITE_QUANTILE)), 1e-9)
     # In NumPy, because sums of PyTorch depend on the number of threads.
     dielectric, level = 1 - gloss.metalness.numpy(), gloss.log_level.exp().numpy()
-    mean = float((dielectric * level).sum(dtype=np.float64)) / max(float(dielectric.sum(dtype=np.float64)), 1e-9)
+    mean = float((dielectric * level).sum(dtype=np.float64)) / max(
+        float(dielectric.sum(dtype=np.float64)), 1e-9
+    )
     return float(np.clip(mean / _DIELECTRIC, white, _MOST_EXPOSURE * white))

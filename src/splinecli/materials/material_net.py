@@ -1,8 +1,8 @@
 """The material net, which reads the gloss of each pixel off the tokens of the set branch.
 
-The tokens were trained to explain away highlights, so they already describe them. One more exchange with the other
-pixels of the capture is trained for the materials: an object has few glosses, and each is visible only in the pixels
-whose normals reflect a light to the camera.
+The tokens were trained to explain away highlights, so they already describe them. One more exchange
+with the other pixels of the capture is trained for the materials: an object has few glosses, and
+each is visible only in the pixels whose normals reflect a light to the camera.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from splinecli.estimate.networks.set_branch import ContextLayer, PixelTokens, Summary, brightness_level
+from splinecli.estimate.networks.set_branch import (
+    ContextLayer,
+    PixelTokens,
+    Summary,
+    brightness_level,
+)
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import manifest, resolve_weights
-from splinecli.system.weight_files import (
-    load_shipped,
-)
+from splinecli.system.weight_files import load_shipped
 
 MATERIAL_FORMAT = "splinecli-material-net-1"
 
@@ -27,20 +30,25 @@ _LEAST_ERROR = 0.02  # of a roughness
 
 
 class Gloss(NamedTuple):
-    """The materials of P pixels, each (P,). Reflectances are relative to the pixel's largest observation."""
+    """The materials of P pixels, each (P,). Reflectances are relative to the pixel's largest
+    observation.
+    """
 
     roughness: Tensor
     roughness_error: Tensor  # expected absolute error
     metalness: Tensor  # the probability that it is a metal, or its share in half metals
     log_base: Tensor  # natural logarithm of the base
     log_base_error: Tensor  # expected absolute error
-    log_level: Tensor  # natural logarithm of the reflectance of a dielectric's facets at normal incidence
+    # natural logarithm of the reflectance of a dielectric's facets at normal incidence
+    log_level: Tensor
     minnaert: Tensor  # exponent of the diffuse light
     tail: Tensor  # exponent of the facets' distribution
 
 
 class MaterialNet(nn.Module):
-    """Predicts the gloss of pixels from their tokens, and from those of a sample of their capture."""
+    """Predicts the gloss of pixels from their tokens, and from those of a sample of their
+    capture.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,13 +57,17 @@ class MaterialNet(nn.Module):
         self.context = ContextLayer(width)
         self.perceptron = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU())
         self.mix = nn.Linear(2 * width, width)
-        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, _HIDDEN), nn.GELU(), nn.Linear(_HIDDEN, 8))
+        self.out = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, _HIDDEN), nn.GELU(), nn.Linear(_HIDDEN, 8)
+        )
 
-    def forward(self, pixels: PixelTokens, brightness: Tensor, known: Summary | None = None) -> tuple[Gloss, Summary]:
+    def forward(
+        self, pixels: PixelTokens, brightness: Tensor, known: Summary | None = None
+    ) -> tuple[Gloss, Summary]:
         """Return the gloss, and the summary of the captures, for further pixels of them.
 
-        Pixel p belongs to capture p % G, whose brightness (G,) is that of CaptureContext. `known` is the summary of one
-        capture; without one, the pixels of each capture attend to each other.
+        Pixel p belongs to capture p % G, whose brightness (G,) is that of CaptureContext. `known`
+        is the summary of one capture; without one, the pixels of each capture attend to each other.
         """
         level = brightness_level(pixels.scale, brightness)
         inputs = torch.cat((pixels.tokens, pixels.normal_z, level, pixels.n_lights.log()), dim=1)
@@ -78,4 +90,6 @@ class MaterialNet(nn.Module):
 def material_networks() -> tuple[SplineNet, MaterialNet]:
     """Load spline-net, whose tokens describe materials, and the material net. Raises ModelError."""
     shipped = manifest()["spline-net"]["material_net"]
-    return resolve_weights("spline-net").network, load_shipped(MaterialNet(), shipped, MATERIAL_FORMAT).float().eval()
+    return resolve_weights("spline-net").network, load_shipped(
+        MaterialNet(), shipped, MATERIAL_FORMAT
+    ).float().eval()

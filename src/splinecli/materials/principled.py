@@ -1,10 +1,12 @@
-"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels viewed from +z.
+"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels
+viewed from +z.
 
-The BRDF is isotropic and gray. A pixel's observation is the mean of its colour channels, and the model is nearly
-linear in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
+The BRDF is isotropic and gray. A pixel's observation is the mean of its colour channels, and the
+model is nearly linear in the base colour, so one channel is enough. Every parameter is a tensor (P,
+1).
 
-As in Disney's own later code, Smith's shadowing uses the roughness directly, without the remapping of 2012. The lobe is
-never narrower than at roughness 0.1, which float32 still resolves.
+As in Disney's own later code, Smith's shadowing uses the roughness directly, without the remapping
+of 2012. The lobe is never narrower than at roughness 0.1, which float32 still resolves.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
-    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in CyclesPS.
+    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in
+    CyclesPS.
 
     The last six are additions to Burley's model.
     """
@@ -30,28 +33,32 @@ class PrincipledMaterial:
     sheen: Tensor
     clearcoat: Tensor
     clearcoat_gloss: Tensor
-    # If above 0, the diffuse light loses this share at grazing angles, both entering and leaving, as through the
-    # smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
+    # If above 0, the diffuse light loses this share at grazing angles, both entering and leaving,
+    # as through the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left
+    # out.
     interface_loss: Tensor
-    # kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): below 1 the falloff is
-    # flat as on dust, above 1 steep as on marble.
+    # kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): below 1 the
+    # falloff is flat as on dust, above 1 steep as on marble.
     minnaert: Tensor
-    # gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is GGX; smaller
-    # values give longer tails.
+    # gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2
+    # is GGX; smaller values give longer tails.
     tail_exponent: Tensor
-    second_share: Tensor  # share of the facets that form a second highlight, such as the flakes of a metallic paint
+    # share of the facets that form a second highlight, such as the flakes of a metallic paint
+    second_share: Tensor
     second_roughness: Tensor  # the roughness of the second set of facets
-    retro: Tensor  # a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour
+    # a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour
+    retro: Tensor
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
         """Return the materials of some of the pixels. An index tensor may repeat pixels."""
         return PrincipledMaterial(*(getattr(self, field.name)[pixels] for field in fields(self)))
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-        """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P, D).
+        """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P,
+        D).
 
-        n_dot_l (P, D) is negative in attached shadow, where radiance is zero. n_dot_v (P, 1) is positive. l_dot_v is
-        (D) or (P, D).
+        n_dot_l (P, D) is negative in attached shadow, where radiance is zero. n_dot_v (P, 1) is
+        positive. l_dot_v is (D) or (P, D).
         """
         lit = n_dot_l.clamp(min=0)
         # Light from behind the surface has no half vector, and rounding would give NaN.
@@ -61,13 +68,18 @@ class PrincipledMaterial:
         fresnel = schlick_weight(l_dot_h)
 
         grazing_90 = torch.where(
-            self.interface_loss > 0, -self.interface_loss, 2 * self.roughness * l_dot_h * l_dot_h - 0.5
+            self.interface_loss > 0,
+            -self.interface_loss,
+            2 * self.roughness * l_dot_h * l_dot_h - 0.5,
         )
-        diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
+        diffuse = (1 + grazing_90 * schlick_weight(lit)) * (
+            1 + grazing_90 * schlick_weight(n_dot_v)
+        )
         if bool((self.minnaert != 1).any()):
             diffuse = diffuse * _power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
         if bool((self.retro > 0).any()):
-            # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart.
+            # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are
+            # 21 degrees apart.
             diffuse = diffuse + self.retro * l_dot_h ** (2 * 20)
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
@@ -85,7 +97,12 @@ class PrincipledMaterial:
                 coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared)
             )
             quarter = torch.full_like(n_dot_v, 0.25**2)
-            coat = coat * smith_ggx(n_dot_v, quarter) * smith_ggx(lit, quarter) * (0.04 + 0.96 * fresnel)
+            coat = (
+                coat
+                * smith_ggx(n_dot_v, quarter)
+                * smith_ggx(lit, quarter)
+                * (0.04 + 0.96 * fresnel)
+            )
             radiance = radiance + 0.25 * self.clearcoat * coat
         return radiance * lit
 
@@ -94,12 +111,17 @@ class PrincipledMaterial:
         return self.base + 0.08 * self.specular * (1 - self.metallic)
 
 
-def _facets(n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor) -> Tensor:
-    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is 2."""
+def _facets(
+    n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
+) -> Tensor:
+    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is
+    2.
+    """
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
     if bool((tail_exponent < 2).any()):
-        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at gamma = 2
+        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at
+        # gamma = 2
         narrow = alpha_squared.clamp(max=0.999)
         norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
         lobe = norm * _power(spread, -tail_exponent)
@@ -109,7 +131,9 @@ def _facets(n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Te
 
 
 def schlick_weight(cosine: Tensor) -> Tensor:
-    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel approximation."""
+    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel
+    approximation.
+    """
     complement = (1 - cosine).clamp(0, 1)
     square = complement * complement
     return square * square * complement
@@ -121,5 +145,7 @@ def _power(base: Tensor, exponent: Tensor) -> Tensor:
 
 
 def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 - a^2)(n.x)^2))."""
+    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 -
+    a^2)(n.x)^2)).
+    """
     return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())

@@ -1,11 +1,13 @@
-"""Unit normals: their length, angles and errors in degrees, their pictures, and slopes and curvatures.
+"""Unit normals: their length, angles and errors in degrees, their pictures, and slopes and
+curvatures.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
-Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y) with unit normals n
-= (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of (nx, ny) by x and y. Its determinant is
-the Gaussian curvature, because normals rotate by as much as the surface does (Gauss), and half its trace is the mean
-curvature (do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).
+Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y)
+with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of
+(nx, ny) by x and y. Its determinant is the Gaussian curvature, because normals rotate by as much as
+the surface does (Gauss), and half its trace is the mean curvature (do Carmo, Differential Geometry
+of Curves and Surfaces, 1976, 3-3).
 """
 
 from dataclasses import dataclass
@@ -16,7 +18,8 @@ from numpy.typing import NDArray
 
 Convention = Literal["opengl", "directx"]
 
-# The background of an encoded image may be gray, which stands for the zero vector. No real normal is this short.
+# The background of an encoded image may be gray, which stands for the zero vector. No real normal
+# is this short.
 SHORTEST_IN_PICTURE = 0.5
 _Float = TypeVar("_Float", bound=np.floating)
 
@@ -24,20 +27,24 @@ _Float = TypeVar("_Float", bound=np.floating)
 def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
     """Scale vectors (..., 3) to unit length. Zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    scaled: NDArray[_Float] = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    scaled: NDArray[_Float] = np.divide(
+        vectors, length, out=np.zeros_like(vectors), where=length > 0
+    )
     return scaled
 
 
 def spread_of(normals: NDArray[np.floating]) -> float:
-    """Return the second largest standard deviation of unit normals (P, 3): small for a flat object."""
+    """Return the second largest standard deviation of unit normals (P, 3):
+    small for a flat object.
+    """
     return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
 
 
 def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the angles (...) in degrees between unit vectors a and b (..., 3), float64.
 
-    Uses atan2 of the cross and the dot product, which is accurate near 0 and 180 degrees, where acos loses half its
-    digits.
+    Uses atan2 of the cross and the dot product, which is accurate near 0 and 180 degrees, where
+    acos loses half its digits.
     """
     a64, b64 = np.asarray(a, np.float64), np.asarray(b, np.float64)
     sine = np.linalg.norm(np.cross(a64, b64), axis=-1)
@@ -47,11 +54,16 @@ def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
 
 
 def encode_picture(
-    normals: NDArray[np.floating], mask: NDArray[np.bool_], *, bits: int = 16, convention: Convention = "opengl"
+    normals: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    *,
+    bits: int = 16,
+    convention: Convention = "opengl",
 ) -> NDArray[np.unsignedinteger]:
     """Encode a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
 
-    A component n becomes (n + 1) / 2 of full scale. Green points up with "opengl" and down with "directx".
+    A component n becomes (n + 1) / 2 of full scale. Green points up with "opengl" and down with
+    "directx".
     """
     signs = np.array([1.0, 1.0 if convention == "opengl" else -1.0, 1.0])
     top = 2**bits - 1
@@ -64,7 +76,9 @@ def encode_picture(
 
 def describe(convention: Convention) -> str:
     """Return the text to write into normal map files: the frame, and the direction of green."""
-    return f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+    return (
+        f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+    )
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
@@ -75,7 +89,9 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     vectors = picture.astype(np.float64) * 2 / np.iinfo(picture.dtype).max - 1
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     is_normal = picture.any(axis=-1, keepdims=True) & (length > SHORTEST_IN_PICTURE)
-    decoded: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=is_normal)
+    decoded: NDArray[np.float64] = np.divide(
+        vectors, length, out=np.zeros_like(vectors), where=is_normal
+    )
     return decoded
 
 
@@ -97,19 +113,23 @@ def angular_error_map_deg(
 ) -> NDArray[np.float32]:
     """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
 
-    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a normal matters: one
-    that points the opposite way has an error of 180 degrees, not 0.
+    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a
+    normal matters: one that points the opposite way has an error of 180 degrees, not 0.
     """
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
     # Row by row, because a map of many megapixels in float64 would need several gigabytes.
-    for row, row_scored, row_normals, row_truth in zip(errors, scored, normals, ground_truth, strict=True):
+    for row, row_scored, row_normals, row_truth in zip(
+        errors, scored, normals, ground_truth, strict=True
+    ):
         row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
     return errors
 
 
 def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
-    """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are NaN."""
+    """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are
+    NaN.
+    """
     errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
     if not errors.size:
         return None
@@ -122,8 +142,11 @@ def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
     )
 
 
-def gradient_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the surface is too steep.
+def gradient_of_normals(
+    normal_map: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the
+    surface is too steep.
 
     The normals (H, W, 3) are unit in the mask (H, W); x right, y up, z to the camera.
     """
@@ -137,10 +160,13 @@ def curvature_of_normals(
 ) -> NDArray[np.float32]:
     """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
 
-    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative mean curvature. The
-    normals are filtered with a standard deviation of `sigma` pixels; noise falls with its square.
+    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative
+    mean curvature. The normals are filtered with a standard deviation of `sigma` pixels; noise
+    falls with its square.
     """
-    (xx, xy), (yx, yy) = (_derivatives(normal_map[..., component], mask, sigma) for component in (0, 1))
+    (xx, xy), (yx, yy) = (
+        _derivatives(normal_map[..., component], mask, sigma) for component in (0, 1)
+    )
     curvatures = np.stack(((xx + yy) / 2, xx * yy - xy * yx), axis=-1)
     return np.where(mask[..., None], curvatures, np.nan).astype(np.float32)
 
@@ -150,21 +176,25 @@ def _derivatives(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the derivatives (H, W) of values by x (right) and y (up).
 
-    They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights. Moments of a Gaussian
-    are its derivatives. Inside, the slopes are the derivatives of the filtered values; at the mask's edge, those would
-    be too small.
+    They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights.
+    Moments of a Gaussian are its derivatives. Inside, the slopes are the derivatives of the
+    filtered values; at the mask's edge, those would be too small.
     """
     from scipy.ndimage import gaussian_filter
 
     def moment(of: NDArray[np.float64], down: int, right: int) -> NDArray[np.float64]:
         """Return the sum of the weighted `of`, times offsets to these powers."""
-        found = sigma ** (2 * (down + right)) * gaussian_filter(of, sigma, order=(down, right), mode="constant")
+        found = sigma ** (2 * (down + right)) * gaussian_filter(
+            of, sigma, order=(down, right), mode="constant"
+        )
         return np.asarray(found + (sigma**2 * moment(of, 0, 0) if 2 in (down, right) else 0))
 
     inside = mask.astype(np.float64)
     inner = np.where(mask, values, 0).astype(np.float64)
     weight = np.maximum(moment(inside, 0, 0), 1e-9)
-    right, down, value = (moment(*m) / weight for m in ((inside, 0, 1), (inside, 1, 0), (inner, 0, 0)))
+    right, down, value = (
+        moment(*m) / weight for m in ((inside, 0, 1), (inside, 1, 0), (inner, 0, 0))
+    )
     least = 1e-3 * sigma**2  # where the mask is a line
     rr = moment(inside, 0, 2) / weight - right**2 + least
     dd = moment(inside, 2, 0) / weight - down**2 + least
@@ -172,4 +202,6 @@ def _derivatives(
     of_right = moment(inner, 0, 1) / weight - value * right
     of_down = moment(inner, 1, 0) / weight - value * down
     determinant = np.maximum(rr * dd - rd**2, least**2)
-    return (dd * of_right - rd * of_down) / determinant, -(rr * of_down - rd * of_right) / determinant
+    return (dd * of_right - rd * of_down) / determinant, -(
+        rr * of_down - rd * of_right
+    ) / determinant

@@ -1,8 +1,9 @@
-"""The pixels of a map: their rays through a pinhole camera, and square blocks of pixels, for coarser scales.
+"""The pixels of a map: their rays through a pinhole camera, and square blocks of pixels, for
+coarser scales.
 
-A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows count down, and
-(0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of docs/files-and-frames.md: x right, y up,
-z to the camera.
+A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows
+count down, and (0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of
+docs/files-and-frames.md: x right, y up, z to the camera.
 """
 
 from __future__ import annotations
@@ -19,31 +20,42 @@ from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, In
 
 Places = NDArray[np.number[Any]]
 
-_LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
+# Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
+_LARGEST = 1e6
 
 
 def pixel_rays(mask: Bools, camera_matrix: Floats) -> Float64Array:
-    """Return the points (P, 3) at depth 1, z = -1, on the rays from a camera at the origin to pixels of a mask (H, W).
+    """Return the points (P, 3) at depth 1, z = -1, on the rays from a camera at the origin to
+    pixels of a mask (H, W).
 
-    Raises UsageError if the camera matrix is not 3 x 3, or InputError if it is not a valid camera matrix.
+    Raises UsageError if the camera matrix is not 3 x 3, or InputError if it is not a valid camera
+    matrix.
     """
     rows, columns = np.nonzero(mask)
     return rays_at(rows, columns, camera_matrix)
 
 
 def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Float64Array:
-    """Return the points (N, 3) of pixel_rays at rows and columns (N,) of the image. Raises the same errors."""
+    """Return the points (N, 3) of pixel_rays at rows and columns (N,) of the image. Raises the same
+    errors.
+    """
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
     return image @ ray_basis(camera_matrix)
 
 
-def image_points(points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None) -> Float64Array:
-    """Return the columns and rows (P, 2) of the projections of points (P, 3); without a matrix they are orthographic.
+def image_points(
+    points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None
+) -> Float64Array:
+    """Return the columns and rows (P, 2) of the projections of points (P, 3); without a matrix they
+    are orthographic.
 
-    The points are relative to the camera, or without a matrix in pixels from the centre of the image of `shape` (H, W).
+    The points are relative to the camera, or without a matrix in pixels from the centre of the
+    image of `shape` (H, W).
     """
     if camera_matrix is None:
-        return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)
+        return np.asarray(
+            points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64
+        )
     image = points.astype(np.float64) * (1, -1, -1) @ np.asarray(camera_matrix, np.float64).T
     return np.asarray(image[:, :2] / image[:, 2:])
 
@@ -56,8 +68,8 @@ def focal_length(camera_matrix: Floats) -> float:
 def ray_basis(camera_matrix: Floats) -> Float64Array:
     """Return the rows (3, 3) that map an image point (column, row, 1) to its ray.
 
-    The first row is the step of a ray from one column to the next, the second the step from one row to the next, and
-    the third the ray of the image's origin. Raises the errors of pixel_rays.
+    The first row is the step of a ray from one column to the next, the second the step from one row
+    to the next, and the third the ray of the image's origin. Raises the errors of pixel_rays.
     """
     matrix = np.asarray(camera_matrix, np.float64)
     if matrix.shape != (3, 3):
@@ -112,20 +124,28 @@ class Blocks:
         return (sums / np.bincount(block)[:, None]).astype(values.dtype)
 
     def shrink_camera(self, camera_matrix: Floats | None) -> Floats | None:
-        """Return the camera matrix in blocks from the matrix in pixels; None for an orthographic camera."""
+        """Return the camera matrix in blocks from the matrix in pixels; None for an orthographic
+        camera.
+        """
         if camera_matrix is None:
             return None
-        shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
+        shrunk = (
+            np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
+        )
         return np.asarray(shrunk @ camera_matrix)
 
     def interpolate(self, depth: Floats, mask: Bools) -> Floats:
-        """Return the depths (P,) of the pixels of a mask (H, W) from the depths of the blocks (h, w)."""
+        """Return the depths (P,) of the pixels of a mask (H, W) from the depths of the blocks (h,
+        w).
+        """
         if self.step == 1:
             return depth[mask]
         from scipy.ndimage import map_coordinates
 
         places = [(axis - self._shift) / self.step for axis in np.nonzero(mask)]
-        return np.asarray(map_coordinates(self.spread(depth[self.mask]), places, order=1, mode="nearest"))
+        return np.asarray(
+            map_coordinates(self.spread(depth[self.mask]), places, order=1, mode="nearest")
+        )
 
     def numbers_at(self, rows: Integers, columns: Integers) -> Integers:
         """Return the numbers (P,) of the blocks of some pixels."""
@@ -133,7 +153,9 @@ class Blocks:
         return np.asarray(number[rows // self.step, columns // self.step])
 
     def spread(self, values: Array) -> Array:
-        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells copy the nearest block."""
+        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells copy the
+        nearest block.
+        """
         from scipy.ndimage import distance_transform_edt
 
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
@@ -141,7 +163,9 @@ class Blocks:
         return np.asarray(values[number[tuple(nearest)]])
 
     def sample(self, maps: Float32Array, rows: Integers, columns: Integers) -> Float32Array:
-        """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation between the centres."""
+        """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation
+        between the centres.
+        """
         height, width, count = maps.shape
         found = np.zeros((len(rows), count), np.float32)
         y, x = (

@@ -1,7 +1,8 @@
-"""Robust Lambertian fits in NumPy by weighted least squares, and the closed form of 3 x 3 systems that all fits use.
+"""Robust Lambertian fits in NumPy by weighted least squares, and the closed form of 3 x 3 systems
+that all fits use.
 
-`inverse_3x3` takes NumPy arrays and torch tensors alike. It limits its pivots from below, so that the result stays
-positive definite.
+`inverse_3x3` takes NumPy arrays and torch tensors alike. It limits its pivots from below, so that
+the result stays positive definite.
 """
 
 from collections.abc import Sequence
@@ -13,14 +14,17 @@ from numpy.typing import NDArray
 from splinecli.maths import Float64Array, Floats
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
-SMALLEST_PIVOT = 1e-12  # usual limit of pivots if the lights are unit vectors and the largest weight is about 1
+# usual limit of pivots if the lights are unit vectors and the largest weight is about 1
+SMALLEST_PIVOT = 1e-12
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
-    """Invert symmetric positive matrices, given and returned as their xx, yy, zz, xy, xz, yz, each (P,).
+    """Invert symmetric positive matrices, given and returned as their xx, yy, zz, xy, xz, yz, each
+    (P,).
 
-    The factors of A = L D L' are inverted. Pivots are at least `smallest`, and at least 1e-14 of the trace, the
-    limit of rounding. The inverse is therefore positive definite even if the matrix has rank 1 or 2.
+    The factors of A = L D L' are inverted. Pivots are at least `smallest`, and at least 1e-14 of
+    the trace, the limit of rounding. The inverse is therefore positive definite even if the matrix
+    has rank 1 or 2.
     """
     xx, yy, zz, xy, xz, yz = entries
     floor = smallest + 1e-14 * (xx + yy + zz)
@@ -42,16 +46,22 @@ def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
 
 
 def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[Any, Any, Any]:
-    """Multiply symmetric matrices, given as in `inverse_3x3`, by vectors given as their x, y, z, each (P,)."""
+    """Multiply symmetric matrices, given as in `inverse_3x3`, by vectors given as their x, y, z,
+    each (P,).
+    """
     xx, yy, zz, xy, xz, yz = entries
     x, y, z = vector
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
 
 
 def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F), pixel by pixel."""
+    """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F), pixel
+    by pixel.
+    """
     x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
-    entries = [np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
+    entries = [
+        np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    ]
     right_side = [np.einsum("pf,pf->p", axis, values) for axis in (x, y, z)]
     return np.stack(multiply_symmetric(inverse_3x3(entries, SMALLEST_PIVOT), right_side), axis=1)
 
@@ -60,7 +70,9 @@ SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one ar
 
 
 def shadow_weights(observations: Floats) -> Floats:
-    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels whose largest observation is 1."""
+    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels whose largest
+    observation is 1.
+    """
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
@@ -74,10 +86,12 @@ def shade(scaled_normals: Floats, light_directions: Floats) -> Floats:
 def fit_scaled_normals(
     observations: Floats, weights: Floats, light_directions: Floats, *, prior: float = 1e-6
 ) -> Floats:
-    """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
+    """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared
+    residuals of I = l . b.
 
-    Observations and weights are (P, F), light directions (F, 3) or (P, F, 3), of any length. The prior pulls towards a
-    black pixel, so that a pixel without three lit observations has a solution.
+    Observations and weights are (P, F), light directions (F, 3) or (P, F, 3), of any length. The
+    prior pulls towards a black pixel, so that a pixel without three lit observations has a
+    solution.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
@@ -93,18 +107,23 @@ def _sum_over_lights(values: Floats, terms: Floats) -> Floats:
 
 
 def absolute_weights(residuals: Floats) -> Floats:
-    """Return weights with which the next weighted least squares approximates least absolute deviations."""
-    return np.asarray(1 / (np.abs(residuals) + 0.02))  # nearly equal weights far below this residual
+    """Return weights with which the next weighted least squares approximates least absolute
+    deviations.
+    """
+    # nearly equal weights far below this residual
+    return np.asarray(1 / (np.abs(residuals) + 0.02))
 
 
 def fit_robustly(
     values: Floats, lit: Floats, lights: Floats, fits: int, weights: Floats | None = None
 ) -> tuple[Float64Array, Float64Array]:
-    """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
+    """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next
+    fit.
 
-    Each pixel's values (P, F) are scaled to a largest value of 1. The weights `lit` (P, F) do not depend on the fit,
-    for example from shadow_weights; `weights` are for the first fit, by default `lit`. The lights (F, 3) or (P, F,
-    3) have any length, and the number of weighted fits is at least 1.
+    Each pixel's values (P, F) are scaled to a largest value of 1. The weights `lit` (P, F) do not
+    depend on the fit, for example from shadow_weights; `weights` are for the first fit, by default
+    `lit`. The lights (F, 3) or (P, F, 3) have any length, and the number of weighted fits is at
+    least 1.
     """
     weights = lit if weights is None else weights
     for _ in range(fits):
@@ -113,10 +132,14 @@ def fit_robustly(
     return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
 
 
-def lit_values(observations: Floats, dark_share: float, most: int) -> tuple[NDArray[np.intp], Float64Array]:
-    """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F) over each largest one.
+def lit_values(
+    observations: Floats, dark_share: float, most: int
+) -> tuple[NDArray[np.intp], Float64Array]:
+    """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F)
+    over each largest one.
 
-    Pixels below dark_share of the brightest hundredth are treated as dark, for example the background without a mask.
+    Pixels below dark_share of the brightest hundredth are treated as dark, for example the
+    background without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

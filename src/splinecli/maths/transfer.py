@@ -1,5 +1,5 @@
-"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and the curves in ICC
-profiles (ISO 15076-1)."""
+"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and
+the curves in ICC profiles (ISO 15076-1)."""
 
 import re
 import struct
@@ -13,14 +13,18 @@ from splinecli.maths import Float64Array
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
-# The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states it; else linear.
+# The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states
+# it; else linear.
 AUTOMATIC = "auto"
-# An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1.
+# An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored
+# values, 0 to 1.
 TransferCurve = float | tuple[float, ...] | None
 SRGB: TransferCurve = None
 _CODES = np.linspace(0, 1, 256)
 # The curve of most films (ITU-R BT.709), for values of 8 bits.
-BT709: TransferCurve = tuple(np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist())
+BT709: TransferCurve = tuple(
+    np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist()
+)
 GAMMAS = 0.1, 10.0  # the smallest and the largest exponent
 
 
@@ -28,11 +32,14 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
-    return np.asarray(np.rint(255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)), np.uint8)
+    return np.asarray(
+        np.rint(255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)), np.uint8
+    )
 
 
 def parse_transfer(text: str) -> float | None:
-    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear" and AUTOMATIC, None for "srgb".
+    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear" and AUTOMATIC, None for
+    "srgb".
 
     Raises UsageError if the name is unknown, or G is not between 0.1 and 10.
     """
@@ -46,7 +53,10 @@ def parse_transfer(text: str) -> float | None:
             gamma = 0.0
         if GAMMAS[0] <= gamma <= GAMMAS[1]:
             return gamma
-    raise UsageError(f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10")
+    raise UsageError(
+        f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1"
+        " to 10"
+    )
 
 
 def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArray[np.float32]:
@@ -61,7 +71,8 @@ def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArra
     return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)
 
 
-LARGEST_PROFILE = 1 << 22  # Bytes of a profile. Profiles of cameras and screens have a few kilobytes.
+# Bytes of a profile. Profiles of cameras and screens have a few kilobytes.
+LARGEST_PROFILE = 1 << 22
 _SAMPLES = 4096  # of a curve that has no name
 _SAME = 1e-3  # difference of linear values below which two curves are considered equal
 
@@ -73,9 +84,13 @@ def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
         if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
             return None
         (count,) = struct.unpack_from(">I", profile, 128)
-        places = [struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))]
+        places = [
+            struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100))
+        ]
         tags = {name: profile[start : start + length] for name, start, length in places}
-        curves = [_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
+        curves = [
+            _curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags
+        ]
         name = _text(tags[b"desc"]) if b"desc" in tags else ""
     except (struct.error, ValueError, IndexError, OverflowError):
         return None
@@ -83,12 +98,18 @@ def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
     sampled = [decode_transfer(stored, curve) for curve in curves]
     if not curves or any(np.abs(one - sampled[0]).max() > _SAME for one in sampled):
         return None
-    named = (curve for curve in (1.0, SRGB) if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME)
+    named = (
+        curve
+        for curve in (1.0, SRGB)
+        if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME
+    )
     return name, next(named, curves[0])
 
 
 def _curve(tag: bytes) -> TransferCurve:
-    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error if it has no usable curve."""
+    """Return the curve of a tag `curv` or `para`. Raises ValueError or struct.error if it has no
+    usable curve.
+    """
     stored = np.linspace(0, 1, _SAMPLES)
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)
@@ -110,7 +131,9 @@ def _curve(tag: bytes) -> TransferCurve:
 
 
 def _parametric(stored: Float64Array, given: list[float]) -> Float64Array:
-    """Return the linear values of a parametric curve with 3, 4, 5 or 7 parameters, in the order of the standard."""
+    """Return the linear values of a parametric curve with 3, 4, 5 or 7 parameters, in the order of
+    the standard.
+    """
     g, a, b = given[:3]
     if a <= 0:
         raise ValueError

@@ -18,12 +18,16 @@ Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W)
 
 
 def encode_png(
-    picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | None = None, *, film: bool = False
+    picture: NDArray[np.unsignedinteger],
+    texts: Mapping[str, str] | None = None,
+    *,
+    film: bool = False,
 ) -> bytes:
     """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
 
-    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a film have the primaries and the
-    transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot encode the picture.
+    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a film have the
+    primaries and the transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot encode
+    the picture.
     """
     import cv2
 
@@ -32,20 +36,28 @@ def encode_png(
         raise OutputError("the picture cannot be encoded as PNG")
     file = encoded.tobytes()
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
-    chunks = [b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()]
+    chunks = [
+        b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()
+    ]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
-    whole = [struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks]
-    return file[:33] + b"".join(whole) + file[33:]  # behind the header, which is the first chunk of a file
+    whole = [
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        for chunk in chunks
+    ]
+    # behind the header, which is the first chunk of a file
+    return file[:33] + b"".join(whole) + file[33:]
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
+# of the colour scale; larger errors have the last colour: the scale serves the small errors
+TOP_DEG = 30.0
 TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) for third in range(4)}
 TITLE = "angular error (deg)"
 
 
 def albedo_picture(albedo: Float32Array, mask: Bools) -> Picture:
-    """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the pixels are white.
+    """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the
+    pixels are white.
 
     The scale depends on the pixels of the mask (H, W) alone, which is not empty.
     """
@@ -59,20 +71,26 @@ def confidence_picture(confidence_map: Float32Array, _: Bools | None = None) -> 
 
 
 def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
-    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT, black outside the mask."""
+    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT, black
+    outside the mask.
+    """
     shading = (normal_map @ unit(np.array(PREVIEW_LIGHT, np.float32))) * mask
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
 def signed_picture(values: Float32Array, _: Bools, scale: float) -> Picture:
-    """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale black, scale white."""
+    """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale
+    black, scale white.
+    """
     first = values if values.ndim == 2 else values[..., 0]
     share = np.nan_to_num(first / scale).clip(-1, 1)
     return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)
 
 
 def colour_errors(error_map_deg: Floats) -> Picture:
-    """Return the colours (H, W, 3) of errors (H, W) in degrees: viridis, from violet for 0 to yellow; white for NaN."""
+    """Return the colours (H, W, 3) of errors (H, W) in degrees: viridis, from violet for 0 to
+    yellow; white for NaN.
+    """
     import cv2
 
     known = np.isfinite(error_map_deg)

@@ -1,4 +1,6 @@
-"""Plots: light directions, observation maps, learning curves, and the maps of several methods side by side."""
+"""Plots: light directions, observation maps, learning curves, and the maps of several methods side
+by side.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,26 @@ class MethodStyle(NamedTuple):
     marker: str
 
 
-# The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can distinguish. Gray
-# replaces their yellow, which is too light for a line on white. The markers help in prints without colour.
-_COLOURS = ["#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080", "#7F5F3F"]
+# The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can
+# distinguish. Gray replaces their yellow, which is too light for a line on white. The markers help
+# in prints without colour.
+_COLOURS = [
+    "#D55E00",
+    "#0072B2",
+    "#000000",
+    "#009E73",
+    "#CC79A7",
+    "#56B4E9",
+    "#E69F00",
+    "#808080",
+    "#7F5F3F",
+]
 _STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """Return the style of each method. It depends on the registry's order, so it is the same in every plot.
+    """Return the style of each method. It depends on the registry's order, so it is the same in
+    every plot.
 
     Names that are not in the registry follow in their order.
     """
@@ -51,17 +65,20 @@ def png_bytes(figure: Figure, dpi: int) -> bytes:
     """Return a figure as a PNG file, on white regardless of the user's matplotlibrc."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no warning.
+        # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no
+        # warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
     return buffer.getvalue()
 
 
-def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64Array | None = None) -> bytes:
+def sky_plot(
+    light_directions: Float64Array, title: str, *, errors_deg: Float64Array | None = None
+) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
-    The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle of this radius is
-    drawn around each light.
+    The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle
+    of this radius is drawn around each light.
     """
     from matplotlib.figure import Figure
 
@@ -70,20 +87,26 @@ def sky_plot(light_directions: Float64Array, title: str, *, errors_deg: Float64A
     angle = np.linspace(0, 2 * np.pi, 361)
     for ring_deg in (15, 30, 45, 60, 75, 90):
         radius = np.sin(np.radians(ring_deg))
-        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1)
+        axes.plot(
+            radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1
+        )
         if ring_deg < 90:  # the labels of 90 and 75 degrees would overlap
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
     if errors_deg is not None:  # circles on the sphere around the directions
         radii = np.radians(errors_deg)[:, None, None]
-        across = unit(np.cross(light_directions, np.eye(3)[np.abs(light_directions).argmin(axis=1)]))
+        across = unit(
+            np.cross(light_directions, np.eye(3)[np.abs(light_directions).argmin(axis=1)])
+        )
         turned = np.cross(light_directions, across)
         around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
         for outline in light_directions[:, None] * np.cos(radii) + around * np.sin(radii):
             axes.plot(*outline[:, :2].T, color="#D55E00", alpha=0.4, linewidth=1, zorder=2)
     axes.scatter(x, y, s=30, color="#D55E00", zorder=3)
     for number, place in enumerate(zip(x, y, strict=True), start=1):
-        axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3)
+        axes.annotate(
+            str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3
+        )
     axes.set_title(printable(title), parse_math=False)
     axes.set_axis_off()
     return png_bytes(figure, 120)
@@ -103,10 +126,12 @@ def observation_map_figure(
     title: str = "",
     grid: Grid = "even",
 ) -> bytes:
-    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all lights.
+    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all
+    lights.
 
-    Row 0 of a map is y = +1. The maps of a pixel share one frame, either the camera's or the pixel's. Values are
-    relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the horizon.
+    Row 0 of a map is y = +1. The maps of a pixel share one frame, either the camera's or the
+    pixel's. Values are relative to the largest observation, from 0 to 1. Empty cells are gray; the
+    circle is the horizon.
 
     Args:
         sparse: (N, w, w), NaN in empty cells.
@@ -123,11 +148,13 @@ def observation_map_figure(
 
     labelled = {"sparse map": sparse, "LI-Net's dense map": dense, truth_label: truth}
     columns = {label: maps for label, maps in labelled.items() if maps is not None}
-    figure = Figure(figsize=(1.7 * len(columns) + 0.8, (1.7 + 0.25) * len(sparse) + 0.7), layout="constrained")
+    figure = Figure(
+        figsize=(1.7 * len(columns) + 0.8, (1.7 + 0.25) * len(sparse) + 0.7), layout="constrained"
+    )
     if title:
         figure.suptitle(title, fontsize=9, parse_math=False)
-    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
-    # represent a single line each.
+    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column
+    # and the top row represent a single line each.
     size = sparse.shape[1]
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
     if grid == "cnn-ps":
@@ -139,10 +166,16 @@ def observation_map_figure(
             axis.set_xticks([])
             axis.set_yticks([])
             axis.set_facecolor("0.85")  # light gray, which the colour scale does not contain
-            circle = Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False)
+            circle = Circle(
+                centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False
+            )
             axis.add_patch(circle)
         axes[-1, place].set_xlabel(name, fontsize=_SMALL)
-    places = [""] * len(sparse) if pixels is None else [f"row {row}, column {col}: " for row, col in pixels]
+    places = (
+        [""] * len(sparse)
+        if pixels is None
+        else [f"row {row}, column {col}: " for row, col in pixels]
+    )
     for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
         axis.set_title(f"{place_in_image}{error:.1f} deg off", fontsize=_SMALL, loc="left")
     bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
@@ -155,9 +188,11 @@ Columns = Mapping[str, Sequence[float | None]]
 
 
 def training_figure(columns: Columns) -> Figure:
-    """Return a matplotlib figure of the loss, the angular errors and the map errors against the step.
+    """Return a matplotlib figure of the loss, the angular errors and the map errors against the
+    step.
 
-    `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was not computed.
+    `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was
+    not computed.
     """
     from matplotlib.figure import Figure
 
@@ -181,13 +216,21 @@ def training_figure(columns: Columns) -> Figure:
         axes.grid(alpha=0.3)
         axes.legend()
         values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-        if (values > 0).all() and values.max() > 20 * values.min():  # An axis whose values span more is logarithmic.
+        if (
+            (values > 0).all() and values.max() > 20 * values.min()
+        ):  # An axis whose values span more is logarithmic.
             axes.set_yscale("log")
     return figure
 
 
-def _plot(axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1) -> None:
-    points = [(step, value) for step, value in zip(columns["step"], columns[name], strict=True) if value is not None]
+def _plot(
+    axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1
+) -> None:
+    points = [
+        (step, value)
+        for step, value in zip(columns["step"], columns[name], strict=True)
+        if value is not None
+    ]
     if points:
         style = "o" if len(points) == 1 else style  # one point does not make a line
         axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
@@ -204,27 +247,37 @@ def method_maps(
     *,
     title: str,
 ) -> bytes:
-    """Return a PNG file with a column for the ground truth and one for each method: normal map above error map.
+    """Return a PNG file with a column for the ground truth and one for each method: normal map
+    above error map.
 
-    Normals have the colours (n + 1) / 2, errors the scale of colour_errors from 0 to TOP_DEG; other pixels are white.
-    The maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged,
-    so that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
+    Normals have the colours (n + 1) / 2, errors the scale of colour_errors from 0 to TOP_DEG; other
+    pixels are white. The maps are cropped to the mask's bounding box. Small maps are enlarged by a
+    whole factor and large ones averaged, so that the picture stays below 4000 pixels wide. The MAE
+    below each method covers the pixels that have errors.
 
-    The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty. Each method, in the
-    order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels without an error.
+    The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty.
+    Each method, in the order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels
+    without an error.
     """
     from matplotlib.figure import Figure
 
     box = bounding_box(mask)
     height, width = mask[box].shape
     scale = _scale(height, width, columns=1 + len(normal_maps))
-    truth = _resize(_colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale)
-    normals = {name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()}
-    shown_deg = {name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()}
+    truth = _resize(
+        _colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale
+    )
+    normals = {
+        name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()
+    }
+    shown_deg = {
+        name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()
+    }
     errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
-    cell_height, cell_width = (max(side, 150) for side in truth.shape[:2])  # pixels: room for the colour bar and a name
+    # pixels: room for the colour bar and a name
+    cell_height, cell_width = (max(side, 150) for side in truth.shape[:2])
     text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
     gap, line = text // 2, 2 * text
     errors_at = gap + line  # from the bottom, as in matplotlib
@@ -234,7 +287,10 @@ def method_maps(
     figure = Figure(figsize=(width / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
 
     def show(picture: Picture, left: int, bottom: int) -> None:
-        x, y = left + (cell_width - picture.shape[1]) // 2, bottom + (cell_height - picture.shape[0]) // 2
+        x, y = (
+            left + (cell_width - picture.shape[1]) // 2,
+            bottom + (cell_height - picture.shape[0]) // 2,
+        )
         figure.figimage(picture[::-1], x, y, origin="lower")
 
     show(truth, gap, normals_at)
@@ -246,12 +302,22 @@ def method_maps(
         show(errors[name], left, errors_at)
         _write(figure, left + cell_width / 2, names_at + text, name, text)
         _write(figure, left + cell_width / 2, errors_at - text, captions[name], text)
-    _write(figure, width / 2, height - text, title, _text_height(width, [title], most=round(1.2 * text)))
+    _write(
+        figure,
+        width / 2,
+        height - text,
+        title,
+        _text_height(width, [title], most=round(1.2 * text)),
+    )
     return png_bytes(figure, _MAPS_DPI)
 
 
-def _draw_bar(figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1) -> None:
-    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title on one side."""
+def _draw_bar(
+    figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1
+) -> None:
+    """Draw a vertical colour bar of errors, `text` pixels wide,
+    with labels and title on one side.
+    """
     inset = text // 2  # room for half a label at either end
     length, edge = height - 2 * inset, left + text * (side > 0)
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
@@ -264,10 +330,11 @@ def _draw_bar(figure: Figure, left: int, bottom: int, height: int, text: int, *,
 
 
 def error_map_picture(error_map_deg: Floats) -> Picture:
-    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its right.
+    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its
+    right.
 
-    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to
-    256 rows.
+    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024
+    pixels, then padded to 256 rows.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -277,7 +344,9 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
     factor = max(1, min(-(-256 // height), 1024 // width))
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     missing = max(0, 256 - len(picture))
-    picture = np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255)
+    picture = np.pad(
+        picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255
+    )
     height = len(picture)
     text = max(18, height // 22)
     panel = Figure(figsize=(6 * text / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
@@ -291,8 +360,9 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
 def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
     """Return a PNG file with all images of all balls, in rows of up to six.
 
-    The green circle is the outline and the red one the highlight. The red line from the centre to the highlight points
-    towards the lamp. The title has the number of the image, from 1, and the light direction x, y, z.
+    The green circle is the outline and the red one the highlight. The red line from the centre to
+    the highlight points towards the lamp. The title has the number of the image, from 1, and the
+    light direction x, y, z.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
@@ -305,7 +375,11 @@ def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
         axis.set_axis_off()
     for first, ball in zip(np.cumsum([0, *places]), balls, strict=False):
         for number, (x, y, z) in enumerate(ball.directions):
-            axis, circle, highlight = grid[first:].flat[number], ball.circle, ball.highlights[number]
+            axis, circle, highlight = (
+                grid[first:].flat[number],
+                ball.circle,
+                ball.highlights[number],
+            )
             reach = 1.15 * circle.radius
             left, top = max(0, int(circle.x - reach)), max(0, int(circle.y - reach))
             image = read_image(ball.files.images[number])
@@ -314,33 +388,60 @@ def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
             height, width = gray.shape
             extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
             axis.imshow(gray, cmap="gray", vmin=0, extent=extent)
-            axis.set(xlim=(circle.x - reach, circle.x + reach), ylim=(circle.y + reach, circle.y - reach))
+            axis.set(
+                xlim=(circle.x - reach, circle.x + reach), ylim=(circle.y + reach, circle.y - reach)
+            )
             axis.add_patch(Circle((circle.x, circle.y), circle.radius, fill=False, color="#5AC85A"))
-            axis.plot([circle.x, highlight.x], [circle.y, highlight.y], color="#FF3C3C", linewidth=1)
-            axis.plot(highlight.x, highlight.y, "o", color="#FF3C3C", markersize=6, fillstyle="none")
+            axis.plot(
+                [circle.x, highlight.x], [circle.y, highlight.y], color="#FF3C3C", linewidth=1
+            )
+            axis.plot(
+                highlight.x, highlight.y, "o", color="#FF3C3C", markersize=6, fillstyle="none"
+            )
             axis.set_title(f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}", fontsize=_SMALL)
     return png_bytes(figure, 100)
 
 
 def _write(
-    figure: Figure, x: float, y: float, words: str, height: int, *, ha: str = "center", rotation: float = 0
+    figure: Figure,
+    x: float,
+    y: float,
+    words: str,
+    height: int,
+    *,
+    ha: str = "center",
+    rotation: float = 0,
 ) -> None:
     """Write text centred at (x, y) in pixels from the bottom left."""
     from matplotlib.transforms import IdentityTransform
 
     size, in_pixels = height / (_MAPS_DPI / 72), IdentityTransform()
-    figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
+    figure.text(
+        x,
+        y,
+        words,
+        size=size,
+        ha=ha,
+        va="center",
+        rotation=rotation,
+        transform=in_pixels,
+        parse_math=False,
+    )
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
-    """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
+    """Return a text height in pixels at which each line fits into the width; short lines do not
+    fill it.
+    """
     longest = max(18, *(len(line) for line in lines))
-    return min(most, max(10, int(width / (0.62 * longest))))  # characters are 0.62 of their height wide
+    # characters are 0.62 of their height wide
+    return min(most, max(10, int(width / (0.62 * longest))))
 
 
 def _scale(height: int, width: int, columns: int) -> float:
     """Return the factor of enlargement: a whole number, or less than 1."""
-    # All columns without gaps are 3600 pixels wide at most, so the picture stays below 4000. A map has up to 1200 rows.
+    # All columns without gaps are 3600 pixels wide at most, so the picture stays below 4000. A map
+    # has up to 1200 rows.
     most = min(3600 / columns / width, 1200 / height)
     # Small maps are enlarged while their longer side stays within 240 pixels.
     return most if most < 1 else max(1, min(int(most), 240 // max(height, width)))
@@ -356,7 +457,9 @@ def _resize(picture: Picture, scale: float) -> Picture:
 
 
 def _colour_normals(normals: Floats, known: Bools) -> Picture:
-    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if NaN is there."""
+    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if
+    NaN is there.
+    """
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
     colours[~known] = 255
     return colours

@@ -1,6 +1,7 @@
 """Run `infer` on many captures, in this process or in others, and continue if a capture fails.
 
-Duplicate folders are ignored. Captures with up-to-date results are skipped. If a capture fails, its error is recorded.
+Duplicate folders are ignored. Captures with up-to-date results are skipped. If a capture fails, its
+error is recorded.
 """
 
 from __future__ import annotations
@@ -34,16 +35,38 @@ from splinecli.pipeline.infer import (
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.records.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.results.files import UnfinishedError, read_report
-from splinecli.results.pages import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
-from splinecli.system.files import NoRoomError, as_splinecli_error, check_writable, find_mode, resolve, write_text
-from splinecli.system.machine import available_memory, choose_device, count_available_cores, is_out_of_memory, meanwhile
+from splinecli.results.pages import (
+    INDEX,
+    Entry,
+    check_index_free,
+    has_index,
+    index_page,
+    with_earlier,
+)
+from splinecli.system.files import (
+    NoRoomError,
+    as_splinecli_error,
+    check_writable,
+    find_mode,
+    resolve,
+    write_text,
+)
+from splinecli.system.machine import (
+    available_memory,
+    choose_device,
+    count_available_cores,
+    is_out_of_memory,
+    meanwhile,
+)
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder, is_plain
 
 
 @dataclass(frozen=True)
 class BatchItem:
-    """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not exist."""
+    """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not
+    exist.
+    """
 
     folder: Path
     name: str
@@ -53,30 +76,42 @@ class BatchItem:
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[BatchItem]:
     """Return the captures in the order given, without duplicate folders.
 
-    Raises UsageError if images are given instead of their folder, two captures have the same name, or a "folder" that
-    does not exist is the name of a map, format or method.
+    Raises UsageError if images are given instead of their folder, two captures have the same name,
+    or a "folder" that does not exist is the name of a map, format or method.
     """
-    if folders and all(path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path) for path in folders):  # noqa: PTH113
+    are_files = (os.path.isfile(path) for path in folders)  # noqa: PTH113 - Path raises for long names
+    if folders and all(
+        path.suffix.lower() in IMAGE_SUFFIXES and is_file
+        for path, is_file in zip(folders, are_files, strict=True)
+    ):
         given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
-        raise UsageError(f"{given} given, expected their folder", hint=f"Pass the folder {str(folders[0].parent)!r}")
+        raise UsageError(
+            f"{given} given, expected their folder",
+            hint=f"Pass the folder {str(folders[0].parent)!r}",
+        )
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)
     if shard is not None:
-        # Sort by bytes, because the shell's order of captures/* depends on the locale, which may differ between the
-        # machines of a cluster.
+        # Sort by bytes, because the shell's order of captures/* depends on the locale, which may
+        # differ between the machines of a cluster.
         chosen = set(sorted(folders, key=os.fsencode)[shard.number - 1 :: shard.n_parts])
     # Include the captures of the other shards, because their results go to the same place.
     members = {folder: _batch_item(folder) for folder in folders}
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
-            problem = f"{other} and {folder} have the same name, so their results would overwrite each other"
+            problem = (
+                f"{other} and {folder} have the same name, so their results would overwrite"
+                " each other"
+            )
             raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]
 
 
 def _own_path(folder: Path) -> Path:
-    """Return the same path for all spellings of a folder. A link keeps its name, because its results use that name."""
+    """Return the same path for all spellings of a folder. A link keeps its name, because its
+    results use that name.
+    """
     try:
         return resolve(folder) if ".." in folder.parts else folder.absolute()
     except InputError:
@@ -84,7 +119,9 @@ def _own_path(folder: Path) -> Path:
 
 
 def _batch_item(folder: Path) -> BatchItem:
-    """Return the capture in the folder. Raises UsageError for a value that belongs to another option."""
+    """Return the capture in the folder. Raises UsageError for a value that belongs to another
+    option.
+    """
     # If a folder cannot be read, the error is reported when that capture is processed.
     try:
         exists = find_mode(folder) is not None
@@ -99,7 +136,9 @@ def _batch_item(folder: Path) -> BatchItem:
         hint = "Write lists with commas, such as --maps albedo,confidence"
         raise UsageError("the folder does not exist", path=folder, hint=hint)
     kind = "film" if is_film(folder) else "folder"
-    return BatchItem(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
+    return BatchItem(
+        folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder)
+    )
 
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
@@ -107,7 +146,9 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and were kept."""
+    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and
+    were kept.
+    """
 
     status: Status
     report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
@@ -116,12 +157,17 @@ class Outcome:
 
 
 def run_member(
-    member: BatchItem, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
+    member: BatchItem,
+    options: InferOptions,
+    redo: Redo,
+    method: Callable[[], Estimator],
+    observer: Observer,
 ) -> Outcome:
     """Compute one capture of a batch, unless its results are up to date or must be kept.
 
-    `method` returns the estimator; it is called only if the capture is computed. Its UsageError or ModelError is passed
-    on, because it would affect every capture. Raises NoRoomError if the disk is full or read-only.
+    `method` returns the estimator; it is called only if the capture is computed. Its UsageError or
+    ModelError is passed on, because it would affect every capture. Raises NoRoomError if the disk
+    is full or read-only.
     """
     if member.missing is not None:
         return failed(member.name, member.missing, status="missing")
@@ -149,7 +195,9 @@ def run_member(
 
 
 def _failure(member: BatchItem, error: Exception) -> Outcome:
-    """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would fail, too."""
+    """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would
+    fail, too.
+    """
     trace = ""
     if is_out_of_memory(error):
         hint = "Close other programs, or use smaller images"
@@ -165,7 +213,9 @@ def _failure(member: BatchItem, error: Exception) -> Outcome:
     return failed(member.name, error, trace)
 
 
-def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed") -> Outcome:
+def failed(
+    name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed"
+) -> Outcome:
     """Return the outcome of a capture that has no results of this run."""
     document = {"capture": name, "error": str(error), "exit_code": error.exit_code}
     return Outcome(status, document, error.exit_code, trace)
@@ -178,11 +228,12 @@ class ChangedError(OutputError):
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results match the capture in `folder` and the options; None without results.
+    """Return the report in `target` if its results match the capture in `folder` and the options;
+    None without results.
 
-    If an interrupted run left partial results, `warn` receives a sentence about this. Raises ChangedError for results
-    of another capture or other options, InputError, or OutputError if `target` is also the capture's folder, where the
-    user's own files may have the names of results.
+    If an interrupted run left partial results, `warn` receives a sentence about this. Raises
+    ChangedError for results of another capture or other options, InputError, or OutputError if
+    `target` is also the capture's folder, where the user's own files may have the names of results.
     """
     try:
         report = read_report(target)
@@ -195,22 +246,42 @@ def find_earlier(
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            problem, hint = f"contains {found}, but no {REPORT}, and is the folder of the capture", "Add --overwrite"
-            raise OutputError(problem, path=target, hint=f"{hint}, or choose another place with -o") from None
+            problem, hint = (
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                "Add --overwrite",
+            )
+            raise OutputError(
+                problem, path=target, hint=f"{hint}, or choose another place with -o"
+            ) from None
         warn(f"{target}: {error}, so it is computed again")
         return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        SplinecliError,
+    ):
         made = "by another version"
     else:
         if version != __version__:
             made = f"by version {version}"
         elif names := options.changes(earlier):
-            made = f"with another {names[0]}" if len(names) == 1 else f"with other options ({', '.join(names)})"
+            made = (
+                f"with another {names[0]}"
+                if len(names) == 1
+                else f"with other options ({', '.join(names)})"
+            )
         elif stamp != inputs_sha256(options.open(folder), options.weights):
             made = "from other input files"
         else:
             return report
-    hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
+    hint = (
+        "Add --update to redo what changed, --overwrite to redo everything, or choose another"
+        " place with -o"
+    )
     raise ChangedError(f"contains results made {made}", path=target, hint=hint)
 
 
@@ -223,20 +294,23 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions = HERE,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield the outcomes, in order, or as they finish in other processes.
+    """Run `infer_capture` on each folder and yield the outcomes, in order, or as they finish in
+    other processes.
 
     With several captures, or if OUT/index.html already exists, that page is written at the end.
 
     Args:
         folders: the captures. Duplicates are ignored.
         redo: which captures with existing results are computed again.
-        cluster: the processes or machines to run on. 0 workers are as many as the machine's cores and memory allow.
+        cluster: the processes or machines to run on. 0 workers are as many as the machine's cores
+            and memory allow.
 
     Raises:
         UsageError: see list_captures, or the options do not fit the method.
-        InputError, ModelError: a file that the options name does not exist, or the weights cannot be used.
-        OutputError: the output folder cannot be written, or the disk is full. If only the folder of one capture cannot
-            be written, that capture fails and the batch continues.
+        InputError, ModelError: a file that the options name does not exist, or the weights cannot
+            be used.
+        OutputError: the output folder cannot be written, or the disk is full. If only the folder of
+            one capture cannot be written, that capture fails and the batch continues.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
     members = list_captures(folders, shard)
@@ -254,7 +328,9 @@ def infer_batch(
         outcomes = _on_workers(members, options, observer, redo, elsewhere)
     else:
         method = cache(partial(make_method, options))
-        outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
+        outcomes = enumerate(
+            run_member(member, options, redo, method, observer) for member in members
+        )
     for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
@@ -267,13 +343,20 @@ def infer_batch(
 
 
 def _on_workers(
-    members: Sequence[BatchItem], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
+    members: Sequence[BatchItem],
+    options: InferOptions,
+    observer: Observer,
+    redo: Redo,
+    cluster: ClusterOptions,
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it finishes in another process."""
     # Accept any device, because the workers may have GPUs that the command's machine does not have.
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
-    items = (Item((n, each), str(each.folder), expected_bytes(each, options)) for n, each in enumerate(members))
+    items = (
+        Item((n, each), str(each.folder), expected_bytes(each, options))
+        for n, each in enumerate(members)
+    )
     with (
         distributor(infer, Path(options.output), cluster, observer) as workers,
         observer.progress("captures", len(members), unit="captures") as advance,
@@ -281,7 +364,9 @@ def _on_workers(
         began, n_failed, n_pixels = time.monotonic(), 0, 0
         for n_ended, (item, result) in enumerate(workers.run(items), start=1):
             number, member = item.args
-            outcome, warnings = (failed(member.name, result), []) if isinstance(result, LostError) else result
+            outcome, warnings = (
+                (failed(member.name, result), []) if isinstance(result, LostError) else result
+            )
             for warning in warnings:
                 observer.warn(warning)
             n_failed += outcome.exit_code != 0
@@ -316,18 +401,25 @@ def _infer(
 
 @lru_cache(maxsize=1)
 def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
-    """Return this worker's estimator, which takes a second to load. Unlike `method`, options ignore the device."""
+    """Return this worker's estimator, which takes a second to load. Unlike `method`, options ignore
+    the device.
+    """
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
-        problem = f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command"
+        problem = (
+            f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the"
+            " command"
+        )
         hint = "Use the same file, and the same version of splinecli, everywhere"
         raise ModelError(problem, path=options.weights, hint=hint)
     return estimator
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
-    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest exit code."""
+    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest exit
+    code.
+    """
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
@@ -339,7 +431,8 @@ def expected_bytes(member: BatchItem, options: InferOptions) -> float:
 
 
 def choose_workers(members: Sequence[BatchItem], options: InferOptions) -> int:
-    """Return the number of captures that this machine can compute in parallel, given its cores and its memory.
+    """Return the number of captures that this machine can compute in parallel, given its cores and
+    its memory.
 
     A GPU computes one capture at a time.
     """

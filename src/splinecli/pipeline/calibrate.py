@@ -1,4 +1,6 @@
-"""Calibrate lights: read images of balls and of a gray target, and write light files and a report."""
+"""Calibrate lights: read images of balls and of a gray target,
+and write light files and a report.
+"""
 
 import json
 from typing import Any
@@ -27,11 +29,22 @@ from splinecli.system.publishing import held_folder, new_files
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = CALIBRATION, "calibration.json"
-OUTPUT_FILES = (DIRECTIONS, INTENSITIES, CROSSTALK, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
+OUTPUT_FILES = (
+    DIRECTIONS,
+    INTENSITIES,
+    CROSSTALK,
+    POSITIONS,
+    PIXEL_SIZE,
+    CAMERA_MATRIX,
+    PICTURE,
+    REPORT,
+)
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError, OutputError."""
+    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError,
+    OutputError.
+    """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
         target = options.gray_ball or options.gray_card
@@ -39,13 +52,28 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         target_files = None if target is None else find_ball_files(target)
         balls = [
             find_ball_files(folder, mask=mask)
-            for folder, mask in zip(options.balls, options.masks or [None] * len(options.balls), strict=True)
+            for folder, mask in zip(
+                options.balls, options.masks or [None] * len(options.balls), strict=True
+            )
         ]
-        known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
-        circles = [Circle(*numbers) for numbers in options.circles] if options.circles else [None] * len(balls)
+        known = (
+            None
+            if options.compare is None
+            else read_light_directions(options.compare, len(balls[0].images))
+        )
+        circles = (
+            [Circle(*numbers) for numbers in options.circles]
+            if options.circles
+            else [None] * len(balls)
+        )
         with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
             calibrated = [
-                calibrate_ball(ball, circle=circle, camera_matrix=options.camera_matrix, progress=lambda: advance(1))
+                calibrate_ball(
+                    ball,
+                    circle=circle,
+                    camera_matrix=options.camera_matrix,
+                    progress=lambda: advance(1),
+                )
                 for ball, circle in zip(balls, circles, strict=True)
             ]
         lights = combine_balls(calibrated)
@@ -59,20 +87,30 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
             warnings += [f"{target}: {warning}" for warning in of_curve]
             shape: Target = "ball" if options.gray_ball is not None else "card"
             if options.lights_in_channels:
-                crosstalk = measure_crosstalk(target_files, lights.directions, radiometry=radiometry)
+                crosstalk = measure_crosstalk(
+                    target_files, lights.directions, radiometry=radiometry
+                )
             else:
-                intensities = measure_light_intensities(target_files, lights.directions, shape, radiometry=radiometry)
+                intensities = measure_light_intensities(
+                    target_files, lights.directions, shape, radiometry=radiometry
+                )
         lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
         report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
         report["warnings"] += warnings
         report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
-        texts = {DIRECTIONS: rows_text(lights.directions), REPORT: json.dumps(report, indent=2) + "\n"}
+        texts = {
+            DIRECTIONS: rows_text(lights.directions),
+            REPORT: json.dumps(report, indent=2) + "\n",
+        }
         if intensities is not None:
             texts[INTENSITIES] = rows_text(intensities)
         if crosstalk is not None:
             texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
         if lamps is not None and lamps.known:
-            texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
+            texts |= {
+                POSITIONS: rows_text(lamps.positions),
+                PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n",
+            }
             if lamps.view.known:
                 texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
         # Remove files that this run does not overwrite, because they belong to earlier lights.
@@ -85,9 +123,14 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         if intensities is not None:
             observer.say(f"The light intensities are in {options.output / INTENSITIES}")
         if crosstalk is not None:
-            observer.say(f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels")
+            observer.say(
+                f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels"
+            )
         if lamps is not None and lamps.known:
-            observer.say(f"The positions of the lamps are in {options.output / POSITIONS}, for --light-positions")
+            observer.say(
+                f"The positions of the lamps are in {options.output / POSITIONS}, for"
+                " --light-positions"
+            )
         for warning in report["warnings"]:
             observer.warn(warning)
         return report

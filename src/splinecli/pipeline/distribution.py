@@ -1,6 +1,8 @@
-"""Map a function over items in other processes, either on this machine or on the workers of a Dask cluster.
+"""Map a function over items in other processes, either on this machine or on the workers of a Dask
+cluster.
 
-Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its worker is lost.
+Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its
+worker is lost.
 """
 
 from __future__ import annotations
@@ -25,7 +27,12 @@ from splinecli._version import __version__
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.system.files import UNFINISHED, made_folder, read_json, refusals_as_output_errors
-from splinecli.system.machine import available_memory, count_available_cores, import_extra, keep_freed_memory
+from splinecli.system.machine import (
+    available_memory,
+    count_available_cores,
+    import_extra,
+    keep_freed_memory,
+)
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import locked_file
 
@@ -33,22 +40,32 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = 5.0, 6.0, 5.0  # a server has to answer as a scheduler
+# a server has to answer as a scheduler
+_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (
+    5.0,
+    6.0,
+    5.0,
+)
 _LOOK_SECONDS = 0.5  # between two updates of the list of workers
-_ONE_AT_A_TIME = Lock()  # item per worker: the working folder and PyTorch's threads are shared by the whole process
+# item per worker: the working folder and PyTorch's threads are shared by the whole process
+_ONE_AT_A_TIME = Lock()
 SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
 SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 
 @contextmanager
 def connected(options: ClusterOptions) -> Iterator[Client]:
-    """Yield a Dask client, connected to a new cluster of processes on this machine or to a running cluster.
+    """Yield a Dask client, connected to a new cluster of processes on this machine or to a running
+    cluster.
 
     Raises UsageError if Dask is not installed, or no scheduler answers at the address.
     """
     distributed = import_extra("distributed", "cluster")
     if options.address is None:
-        with _local_cluster(options) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+        with (
+            _local_cluster(options) as cluster,
+            distributed.Client(cluster, set_as_default=False) as client,
+        ):
             yield client
         return
     client = _client(_address(options.address))
@@ -67,9 +84,9 @@ def _client(address: str) -> Client:
         async with rpc(address, timeout=_CONNECT_SECONDS) as server:
             return await asyncio.wait_for(server.identity(), _ANSWER_SECONDS)
 
-    # A client waits forever for a server that is not a scheduler, and a client that fails to start can block Dask's
-    # event loop when Python deletes it. We therefore identify the server first. This runs in a separate thread, because
-    # the current one may already have an event loop.
+    # A client waits forever for a server that is not a scheduler, and a client that fails to start
+    # can block Dask's event loop when Python deletes it. We therefore identify the server first.
+    # This runs in a separate thread, because the current one may already have an event loop.
     try:
         with ThreadPoolExecutor(1) as thread:
             identity = thread.submit(asyncio.run, identify()).result()
@@ -92,7 +109,13 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
-    loggers = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
+    loggers = (
+        "distributed",
+        "distributed.client",
+        "distributed.worker",
+        "distributed.scheduler",
+        "tornado",
+    )
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         # No data for a dashboard, which cost processor time and an hour of memory
@@ -105,8 +128,11 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         "distributed.worker.profile.enabled": False,
         # If a worker is lost, its item is retried twice. A running cluster has its own setting.
         "distributed.scheduler.allowed-failures": 2,
-        # A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop them.
-        "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"],
+        # A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop
+        # them.
+        "distributed.worker.preload": [
+            "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
+        ],
         "logging": dict.fromkeys(loggers, "critical"),
         # On a busy machine, a restarted worker may need more time than Dask allows by default.
         "distributed.deploy.lost-worker-timeout": "1 h",
@@ -122,13 +148,18 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
-        except RuntimeError as error:  # raised by Dask; its cause may be an error of the operating system
+        except (
+            RuntimeError
+        ) as error:  # raised by Dask; its cause may be an error of the operating system
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
             reason = "" if cause is None else f" ({cause.strerror or cause})"
             problem = f"the processes of --workers cannot be started{reason}"
-            hint = "Leave --workers out, or raise the limits: each needs a temporary folder and 50 open files"
+            hint = (
+                "Leave --workers out, or raise the limits: each needs a temporary folder and 50"
+                " open files"
+            )
             raise SplinecliError(problem, hint=hint) from error
         try:
             yield cluster
@@ -137,7 +168,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
 
 
 def _address(text: str) -> str:
-    """Return the address of a scheduler, reading the scheduler file if one is given. Raises UsageError."""
+    """Return the address of a scheduler, reading the scheduler file if one is given. Raises
+    UsageError.
+    """
     from distributed.comm.registry import backends
 
     scheme, separator, _ = text.partition("://")
@@ -146,17 +179,26 @@ def _address(text: str) -> str:
     try:
         return str(read_json(Path(text))["address"])
     except (OSError, ValueError, KeyError, TypeError):
-        problem = f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a scheduler file"
-        raise UsageError(problem, hint="'dask scheduler --scheduler-file FILE' writes such a file") from None
+        problem = (
+            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
+            " scheduler file"
+        )
+        raise UsageError(
+            problem, hint="'dask scheduler --scheduler-file FILE' writes such a file"
+        ) from None
 
 
 class LostError(SplinecliError):
-    """A worker was lost, or has too little memory, so this item failed; other items may still succeed."""
+    """A worker was lost, or has too little memory, so this item failed; other items may still
+    succeed.
+    """
 
 
 @dataclass(frozen=True)
 class Item:
-    """The arguments of Work.do, a name for messages, and the memory in bytes that the item needs."""
+    """The arguments of Work.do, a name for messages, and the memory in bytes that the item
+    needs.
+    """
 
     args: tuple[Any, ...]
     name: str
@@ -171,16 +213,25 @@ def _versions() -> dict[str, str]:
 class Work:
     """The settings shared by all items of a command; they are sent with each item."""
 
-    do: Callable[..., Any]  # from the arguments of an item to the result; or raises an error about the worker
+    # from the arguments of an item to the result; or raises an error about the worker
+    do: Callable[..., Any]
     probe: str  # a file in the output folder; a worker that cannot find it uses different storage
-    folder: str = field(default_factory=os.getcwd)  # of the command, against which relative paths are resolved
+    # of the command, against which relative paths are resolved
+    folder: str = field(default_factory=os.getcwd)
     versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:
-        """Prepare this worker. Raises UsageError or InputError if it is incompatible with the command."""
-        for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
+        """Prepare this worker. Raises UsageError or InputError if it is incompatible with the
+        command.
+        """
+        for (package, expected), found in zip(
+            self.versions.items(), _versions().values(), strict=True
+        ):
             if found != expected:
-                raise UsageError(f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS)
+                raise UsageError(
+                    f"found {package} {found}, expected {expected} as on this machine",
+                    hint=SAME_VERSIONS,
+                )
         try:
             os.chdir(self.folder)
         except OSError as error:
@@ -189,7 +240,11 @@ class Work:
         deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
-                raise InputError("the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE)
+                raise InputError(
+                    "the folder is not the one of this machine",
+                    path=probe.parent,
+                    hint=SAME_STORAGE,
+                )
             time.sleep(0.1)
         keep_freed_memory()
 
@@ -212,7 +267,9 @@ def _do(work: Work, *args: Any) -> Any:
 
 @dataclass
 class Distributor:
-    """Assigns items to the workers of a Dask cluster, at most one at a time each. Workers may join and leave."""
+    """Assigns items to the workers of a Dask cluster, at most one at a time each. Workers may join
+    and leave.
+    """
 
     client: Client
     work: Work
@@ -227,9 +284,13 @@ class Distributor:
         Raises SplinecliError, also if the scheduler was lost. The message names the worker.
         """
         # A worker without splinecli could not even unpickle an item.
-        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
+        for address, found in self.client.run(
+            metadata.version, "splinecli", on_error="return"
+        ).items():
             if isinstance(found, metadata.PackageNotFoundError):
-                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
+                raise UsageError(
+                    f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS
+                )
         if not self._workers():
             self.observer.say("waiting for workers")
         source = iter(items)
@@ -244,14 +305,30 @@ class Distributor:
                 hint = "If there is too little memory, use fewer. Dask's output says more"
                 raise SplinecliError("the workers stop while they start", hint=hint)
             while following is not None and len(self.running) < len(workers):
-                limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
+                limits = (
+                    _resources(info).get("MEMORY") or info.get("memory_limit")
+                    for info in workers.values()
+                )
                 largest = max(float(limit or math.inf) for limit in limits)
-                # The workers of a cluster have Dask's memory limits, whereas local workers share this machine's memory.
-                used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
+                # The workers of a cluster have Dask's memory limits, whereas local workers share
+                # this machine's memory.
+                used = (
+                    0.0
+                    if self.options.address
+                    else sum(item.memory for item in self.running.values())
+                )
                 if following.memory > largest:
-                    problem = f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
+                    problem = (
+                        f"it takes about {following.memory / 1e9:.1f} GB of memory, but the"
+                        " largest worker has"
+                    )
                     hint = "Start fewer workers on each machine, with more memory each"
-                    yield following, LostError(f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint)
+                    yield (
+                        following,
+                        LostError(
+                            f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint
+                        ),
+                    )
                 elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:
@@ -261,7 +338,9 @@ class Distributor:
                 yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """Return Dask's information on the usable workers. Raises SplinecliError if the scheduler is lost."""
+        """Return Dask's information on the usable workers. Raises SplinecliError if the scheduler
+        is lost.
+        """
         try:
             found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, TimeoutError, RuntimeError) as error:
@@ -270,9 +349,14 @@ class Distributor:
             raise _scheduler_lost()
         if not self.options.gpu:
             return found
-        with_gpu = {address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1}
+        with_gpu = {
+            address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1
+        }
         if found and not with_gpu and not self.running:
-            hint = "Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'"
+            hint = (
+                "Start the workers of machines with a GPU with 'dask worker ADDRESS --resources"
+                " GPU=1'"
+            )
             raise UsageError("no worker has the Dask resource GPU", hint=hint)
         return with_gpu
 
@@ -282,7 +366,9 @@ class Distributor:
             needed["MEMORY"] = item.memory
         key, resources = f"splinecli-{uuid.uuid4().hex}", needed or None
         try:
-            future = self.client.submit(_do, self.work, *item.args, key=key, resources=resources, pure=False)
+            future = self.client.submit(
+                _do, self.work, *item.args, key=key, resources=resources, pure=False
+            )
         except (OSError, RuntimeError) as error:
             raise _scheduler_lost() from error
         self.running[future] = item
@@ -299,12 +385,16 @@ class Distributor:
         except TimeoutError:
             if future.status == "error":  # the item itself failed
                 raise
-            future.add_done_callback(self._done.put)  # the worker was lost with the result: Dask repeats it
+            # the worker was lost with the result: Dask repeats it
+            future.add_done_callback(self._done.put)
             return
         except KilledWorker as error:
             last = getattr(error.last_worker, "address", error.last_worker)
             problem = f"its worker was lost {error.allowed_failures + 1} times, the last one {last}"
-            hint = "If there was too little memory, start fewer workers on each machine, or make the images smaller"
+            hint = (
+                "If there was too little memory, start fewer workers on each machine, or"
+                " make the images smaller"
+            )
             result = LostError(problem, path=item.name, hint=hint)
         del self.running[future]
         yield item, result
@@ -323,9 +413,11 @@ def _scheduler_lost() -> SplinecliError:
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does, or OutputError.
+    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does,
+    or OutputError.
 
-    The output folder, which is created if needed, serves to check that the workers use the same storage.
+    The output folder, which is created if needed, serves to check that the workers use the same
+    storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:

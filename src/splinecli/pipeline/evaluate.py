@@ -14,10 +14,22 @@ from splinecli.capture import find_captures, open_capture
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.estimate.methods import Estimator, MethodOptions, make_estimator
 from splinecli.evaluation.document import TRIALS, write_results
-from splinecli.evaluation.figures import CaptureFigure, capture_figures, file_stems, relight_first_draw
+from splinecli.evaluation.figures import (
+    CaptureFigure,
+    capture_figures,
+    file_stems,
+    relight_first_draw,
+)
 from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, distinct_names, evaluate_all
-from splinecli.evaluation.trials import CaptureReading, Notes, SharedDraw, TrialSource, TrialStore, open_to_score
+from splinecli.evaluation.trials import (
+    CaptureReading,
+    Notes,
+    SharedDraw,
+    TrialSource,
+    TrialStore,
+    open_to_score,
+)
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.infer import source_bytes
 from splinecli.pipeline.infer_options import ClusterOptions
@@ -32,7 +44,9 @@ Found = TypeVar("Found")
 
 
 class EvaluateOutcome(NamedTuple):
-    """One evaluation for each protocol, the content of results.json, warnings, and what could not be drawn or relit."""
+    """One evaluation for each protocol, the content of results.json, warnings, and what could not
+    be drawn or relit.
+    """
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -43,21 +57,30 @@ class EvaluateOutcome(NamedTuple):
 def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> EvaluateOutcome:
     """Score the methods on the captures, and write the results to the output folder.
 
-    All options are checked before the first image is read. Raises UsageError, ModelError, OutputError, or InputError if
-    no capture could be scored, or a folder or the draws file is wrong.
+    All options are checked before the first image is read. Raises UsageError, ModelError,
+    OutputError, or InputError if no capture could be scored, or a folder or the draws file is
+    wrong.
     """
     captures = [capture for dataset in options.datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
     check_writable(output)
     _check_counts(captures, protocols)
     estimators = [make_estimator(name, options.method_options) for name in options.names]
-    if options.method_options.weights is not None and not any(estimator.weights for estimator in estimators):
+    if options.method_options.weights is not None and not any(
+        estimator.weights for estimator in estimators
+    ):
         names = ", ".join(estimator.name for estimator in estimators)
         raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
-    jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
+    jobs = (
+        1
+        if any(estimator.device.startswith("cuda") for estimator in estimators)
+        else count_available_cores()
+    )
     elsewhere: Elsewhere | None = None
     if cluster := options.cluster.on_cores():
-        elsewhere = partial(_score_on_workers, estimators, options.method_options, cluster, output, observer)
+        elsewhere = partial(
+            _score_on_workers, estimators, options.method_options, cluster, output, observer
+        )
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
@@ -70,25 +93,39 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
                 on_progress=advance,
             )
         protocol, scored = evaluations[0].protocol, evaluations[0].captures
-        folders = {name: folder for folder, name in distinct_names(captures).items() if name in scored}
+        folders = {
+            name: folder for folder, name in distinct_names(captures).items() if name in scored
+        }
         figures: list[CaptureFigure] | None = None
         relit: list[RelightingReport] | None = None
         problems: list[str] = []
         if options.figures:
             draws = [
                 partial(capture_figures, folder, name, stem, estimators, protocol, options.pixels)
-                for (name, folder), stem in zip(folders.items(), file_stems(list(folders)), strict=True)
+                for (name, folder), stem in zip(
+                    folders.items(), file_stems(list(folders)), strict=True
+                )
             ]
             drawn, problems = _try_each("drawing", draws, observer)
             figures = list(chain.from_iterable(drawn))
         if options.relight:
             pairs = [(name, estimator) for name in folders for estimator in estimators]
-            tasks = [partial(relight_first_draw, folders[name], name, each, protocol) for name, each in pairs]
+            tasks = [
+                partial(relight_first_draw, folders[name], name, each, protocol)
+                for name, each in pairs
+            ]
             relit, failed = _try_each("relighting", tasks, observer)
             problems += failed
         document = write_results(output, evaluations, figures, relit)
-    counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
-    untrained = [warning for estimator in estimators for k in counts for warning in estimator.warn_of_lights(k)]
+    counts = sorted(
+        {result.n_lights for evaluation in evaluations for result in evaluation.results}
+    )
+    untrained = [
+        warning
+        for estimator in estimators
+        for k in counts
+        for warning in estimator.warn_of_lights(k)
+    ]
     return EvaluateOutcome(evaluations, document, untrained, problems)
 
 
@@ -96,18 +133,24 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     """Raise UsageError if the number of lights exceeds the lights of every capture."""
     most = 0
     for capture in captures:
-        with suppress(InputError, OSError):  # the evaluation skips the capture and reports the reason
+        with suppress(
+            InputError, OSError
+        ):  # the evaluation skips the capture and reports the reason
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
-            problem = f"the captures have at most {most} lights, too few for draws of {protocol.n_lights}"
+            problem = (
+                f"the captures have at most {most} lights, too few for draws of {protocol.n_lights}"
+            )
             raise UsageError(problem, hint=f"Use --n-lights {most}, or fewer")
 
 
 def _try_each(
     label: str, tasks: Sequence[Callable[[Advance], Found]], observer: Observer
 ) -> tuple[list[Found], list[str]]:
-    """Return the results of tasks, each given the function that counts its progress, and why others failed."""
+    """Return the results of tasks, each given the function that counts its progress, and why others
+    failed.
+    """
     found: list[Found] = []
     problems: list[str] = []
     with observer.progress(label, len(tasks)) as advance:
@@ -127,9 +170,11 @@ def _score_on_workers(
     observer: Observer,
     draws: Sequence[DrawTask],
 ) -> Iterator[tuple[DrawTask, Scored]]:
-    """Yield the draws with their scores as they finish, one item per draw. Only this process writes to the store.
+    """Yield the draws with their scores as they finish, one item per draw. Only this process writes
+    to the store.
 
-    Raises LostError if the workers of a draw were lost, after all others were scored; or see Distributor.run.
+    Raises LostError if the workers of a draw were lost, after all others were scored; or see
+    Distributor.run.
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
@@ -146,7 +191,9 @@ def _score_on_workers(
         raise lost
 
 
-def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
+def _score(
+    command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask
+) -> Scored:
     return _scorer(command, fingerprints, options)(draw)
 
 
@@ -154,15 +201,20 @@ def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: Met
 def _scorer(
     _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions
 ) -> Callable[[DrawTask], Scored]:
-    """Return the function that scores draws of the worker's current command, and keeps the last capture in memory.
+    """Return the function that scores draws of the worker's current command, and keeps the last
+    capture in memory.
 
     It is not reused by other commands, because files may change in between.
     """
     estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
     for name, expected in fingerprints:
         if (found := estimators[name].fingerprint) != expected:
-            problem = f"{name} is {found} here, expected {expected} as on the machine of the command"
-            raise ModelError(problem, hint="Use the same weight file everywhere, and the same --precision")
+            problem = (
+                f"{name} is {found} here, expected {expected} as on the machine of the command"
+            )
+            raise ModelError(
+                problem, hint="Use the same weight file everywhere, and the same --precision"
+            )
     last: tuple[CaptureReading, TrialSource, Notes] | None = None
 
     def score(task: DrawTask) -> Scored:

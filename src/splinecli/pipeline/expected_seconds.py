@@ -1,7 +1,8 @@
-"""The expected seconds of each stage of `infer` for a capture: for its progress bar, and for `info`.
+"""The expected seconds of each stage of `infer` for a capture: for its progress bar, and for
+`info`.
 
-The costs were measured on two cores, with native bfloat16 and with AVX2 alone (benchmarks/large_captures.py). Other
-processors may differ from them by a factor of two.
+The costs were measured on two cores, with native bfloat16 and with AVX2 alone
+(benchmarks/large_captures.py). Other processors may differ from them by a factor of two.
 """
 
 from collections.abc import Collection
@@ -16,8 +17,9 @@ from splinecli.system.machine import count_available_cores
 AUTOMATIC_FROM = 100_000
 """Pixels from which a capture is distilled by default.
 
-For smaller captures, distillation would save little: a sample of 10,000 pixels takes the network almost as long as all
-the normals. From this size on, it takes less than half of the network's time on 1 to 16 cores and an H100."""
+For smaller captures, distillation would save little: a sample of 10,000 pixels takes the network
+almost as long as all the normals. From this size on, it takes less than half of the network's time
+on 1 to 16 cores and an H100."""
 
 
 class _Costs(NamedTuple):
@@ -67,7 +69,9 @@ def expected_seconds(
     pictures += sum(row.seconds + row.seconds_per_pixel * n_pixels for row in maps)
     found = {"read": read, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
     if align:
-        found["read"] += read + _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
+        found["read"] += (
+            read + _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
+        )
     if not network:
         return {**found, "estimate": _OTHER_METHODS * n_pixels / cores}
     if n_pixels >= AUTOMATIC_FROM if distils is None else distils:
@@ -87,7 +91,9 @@ def expected_seconds(
 
 
 def _has_bfloat16() -> bool:
-    """Return whether the processor has bfloat16; without PyTorch, whose import takes longer than all of `info`."""
+    """Return whether the processor has bfloat16; without PyTorch, whose import takes longer than
+    all of `info`.
+    """
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:

@@ -1,4 +1,6 @@
-"""Detect incoming captures once they are complete: folders of images, and films, whose frames are extracted."""
+"""Detect incoming captures once they are complete: folders of images, and films, whose frames are
+extracted.
+"""
 
 import json
 import os
@@ -20,22 +22,29 @@ from splinecli.system.files import read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
-FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
+# the folder in the output folder of `infer` with a folder of frames for each film
+FOLDER = "frames"
 _RECORD = "film.json"
 _FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
-def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo) -> Path:
-    """Return the capture; for a film, the folder in `output` with its frames, which are extracted if needed.
+def unpacked(
+    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo
+) -> Path:
+    """Return the capture; for a film, the folder in `output` with its frames, which are extracted
+    if needed.
 
-    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or extracted again.
-    Raises UsageError without --lights estimate, InputError if the film cannot be read, or its light does not move, or
-    OutputError if the folder contains frames from another film, or other files, or the frames cannot be written.
+    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or
+    extracted again. Raises UsageError without --lights estimate, InputError if the film cannot be
+    read, or its light does not move, or OutputError if the folder contains frames from another
+    film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
     if not reading.finds_lights:
-        raise UsageError(f"{capture} is a film, whose lights have to be found", hint="Add --lights estimate")
+        raise UsageError(
+            f"{capture} is a film, whose lights have to be found", hint="Add --lights estimate"
+        )
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
     refuse_link(folder.parent)
     refuse_link(folder)
@@ -44,16 +53,23 @@ def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer, 
         of_film, sizes = earlier.sha256, earlier.frames
         # Other files would be mistaken for photographs, or for a mask.
         known = {*sizes, _RECORD}
-        others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
+        others = sorted(
+            e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith(".")
+        )
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
             problem = f"contains {others[0]}, which is not a frame of this film"
             raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
-        whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
+        whole = all(
+            is_plain(folder / name) and (folder / name).stat().st_size == sizes[name]
+            for name in sizes
+        )
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
             problem = "contains the frames of another film, or of an earlier version of this one"
-            hint = "Add --update to extract the frames of this film, or choose another place with -o"
+            hint = (
+                "Add --update to extract the frames of this film, or choose another place with -o"
+            )
             raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
@@ -84,19 +100,24 @@ def _earlier(folder: Path) -> _Film:
     return _Film("", "", {})
 
 
-Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
-# Interval between checks of the files of a capture that was already returned. In between, only its folders are checked:
-# their times change when a file is added, removed or replaced, but not when one is overwritten in place.
+# number of files, their bytes, and the newest time of a change in nanoseconds
+Stamp = tuple[int, int, int]
+# Interval between checks of the files of a capture that was already returned. In between, only its
+# folders are checked: their times change when a file is added, removed or replaced, but not when
+# one is overwritten in place.
 SECONDS_BETWEEN_FILES = 60.0
 
 
 @dataclass
 class _Seen:
-    """The contents of a capture, the time of the last change, and whether these contents were returned."""
+    """The contents of a capture, the time of the last change, and whether these contents were
+    returned.
+    """
 
     stamp: Stamp
     since: float
-    folders: dict[str, int]  # its folders, or the film, with their modification times in nanoseconds
+    # its folders, or the film, with their modification times in nanoseconds
+    folders: dict[str, int]
     looked_at: float  # when the stamp was last compared with the files
     returned: bool = False
 
@@ -104,10 +125,11 @@ class _Seen:
 class Arrivals:
     """The complete captures in a folder (its subfolders and films) that were not returned before.
 
-    A capture is complete when it contains a file named `marker`. Without a marker, and for films, it is complete when
-    nothing in it has changed for `seconds`. Names that begin with a dot are ignored, and so is `without`, such as the
-    folder of the results, which must not be a capture or be inside one. A capture that changes after it was returned is
-    returned again; a file that is overwritten in place is noticed within SECONDS_BETWEEN_FILES. `clock` is monotonic.
+    A capture is complete when it contains a file named `marker`. Without a marker, and for films,
+    it is complete when nothing in it has changed for `seconds`. Names that begin with a dot are
+    ignored, and so is `without`, such as the folder of the results, which must not be a capture or
+    be inside one. A capture that changes after it was returned is returned again; a file that is
+    overwritten in place is noticed within SECONDS_BETWEEN_FILES. `clock` is monotonic.
     """
 
     def __init__(
@@ -127,16 +149,23 @@ class Arrivals:
     def take(self) -> list[Path]:
         """Return the captures that became complete since the last call, sorted naturally by name.
 
-        If the results of two captures have the same name, such as a folder and a film, the second is returned by the
-        next call. Raises InputError if the folder cannot be read; afterwards, all its captures are returned again.
+        If the results of two captures have the same name, such as a folder and a film, the second
+        is returned by the next call. Raises InputError if the folder cannot be read; afterwards,
+        all its captures are returned again.
         """
         captures, now = self._captures(), self._clock()
         self._seen = {path: self._seen[path] for path in captures if path in self._seen}
         ready: dict[str, Path] = {}
         for path in captures:
             seen = self._seen.get(path)
-            recent = seen is not None and seen.returned and now - seen.looked_at < SECONDS_BETWEEN_FILES
-            if seen is not None and recent and all(_changed(place) == when for place, when in seen.folders.items()):
+            recent = (
+                seen is not None and seen.returned and now - seen.looked_at < SECONDS_BETWEEN_FILES
+            )
+            if (
+                seen is not None
+                and recent
+                and all(_changed(place) == when for place, when in seen.folders.items())
+            ):
                 continue
             stamp, folders = _stamp(path)
             if seen is None or seen.stamp != stamp:
@@ -154,10 +183,14 @@ class Arrivals:
     def _captures(self) -> list[Path]:
         try:
             with os.scandir(self.folder) as entries:
-                visible = [(entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."]
+                visible = [
+                    (entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."
+                ]
         except OSError as error:
             self._seen.clear()  # a capture that was being read has failed and must be retried
-            raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
+            raise InputError(
+                f"the folder cannot be read ({error.strerror})", path=self.folder
+            ) from error
         paths = [path for is_dir, path in visible if is_dir or is_film(path)]
         return [path for path in paths if path.resolve() not in self._left_out]
 
@@ -169,7 +202,8 @@ def _changed(folder: str) -> int:
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
-    """Return the stamp of a film, or of all files in a folder and its subfolders, and the folders; see _Seen.
+    """Return the stamp of a film, or of all files in a folder and its subfolders, and the folders;
+    see _Seen.
 
     Files that disappear in the meantime are ignored.
     """
@@ -183,5 +217,9 @@ def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
             except OSError:
                 continue
-            count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns, status.st_ctime_ns)
+            count, size, newest = (
+                count + 1,
+                size + status.st_size,
+                max(newest, status.st_mtime_ns, status.st_ctime_ns),
+            )
     return (count, size, newest), folders

@@ -1,6 +1,7 @@
 """Estimate the normals of one capture: read it, check it, run the method, write the results.
 
-Both `infer` and splinecli.estimate_normals use this code. A distilled estimator may replace the network.
+Both `infer` and splinecli.estimate_normals use this code. A distilled estimator may replace the
+network.
 """
 
 from __future__ import annotations
@@ -40,11 +41,23 @@ from splinecli.records.capture_warnings import (
     UNTRAINED_LIGHTS,
     CaptureWarning,
 )
-from splinecli.records.output_files import BYTES_OF_SURFACE, FOUND_LIGHTS, FOUND_MASK, MAPS, PAGE, OutputMap
+from splinecli.records.output_files import (
+    BYTES_OF_SURFACE,
+    FOUND_LIGHTS,
+    FOUND_MASK,
+    MAPS,
+    PAGE,
+    OutputMap,
+)
 from splinecli.results import files
 from splinecli.results.files import report_of
 from splinecli.results.maps import chosen_maps, make_map, map_files, map_picture
-from splinecli.results.material import base_colour_picture, gloss_picture, material_facts, material_warnings
+from splinecli.results.material import (
+    base_colour_picture,
+    gloss_picture,
+    material_facts,
+    material_warnings,
+)
 from splinecli.results.pages import result_page
 from splinecli.surface.make import make_surface
 from splinecli.surface.mesh import check_triangles
@@ -57,14 +70,20 @@ if TYPE_CHECKING:
     from splinecli.estimate.methods.distilled import DistilledEstimator
 
 
-BASE_BYTES = 500 * 2**20  # for Python, PyTorch and a batch of pixels; captures and their refinement need more
-REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # most pixels refined at once (a tile with its margin); bytes per pixel
+# for Python, PyTorch and a batch of pixels; captures and their refinement need more
+BASE_BYTES = 500 * 2**20
+# most pixels refined at once (a tile with its margin); bytes per pixel
+REFINED_PIXELS, REFINED_BYTES = (
+    736**2,
+    1100,
+)
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the memory in bytes that spline-net needs for a capture, in addition to BASE_BYTES.
 
-    It follows from the size of the largest image, the number of pixels in the mask and the number of images read.
+    It follows from the size of the largest image, the number of pixels in the mask and the number
+    of images read.
     """
     of_indirect_light = 4 * n_pixels
     of_pixels = of_indirect_light + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
@@ -72,10 +91,11 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
 
 
 def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
-    """Return the approximate memory in bytes for a capture, from the first image's header and, if large, the mask.
+    """Return the approximate memory in bytes for a capture, from the first image's header and, if
+    large, the mask.
 
-    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images are read; 0 reads
-    all images.
+    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images
+    are read; 0 reads all images.
     """
     try:
         source = open_source()
@@ -85,7 +105,9 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         n_bytes = infer_bytes(size, n_pixels, n_lights)
         is_large = n_bytes > 10**9  # so that it is worth reading the mask
         if is_large and (source.files.mask is not None or source.files.boundaries):
-            n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
+            n_bytes = infer_bytes(
+                size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights
+            )
     except (SplinecliError, OSError, MemoryError):
         return 0.0
     return float(n_bytes)
@@ -94,10 +116,12 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
 def distil_for(
     capture: Capture, estimator: Estimator, wanted: bool | None, clock: Clock | None = None
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
-    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
+    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and
+    warnings.
 
-    Under near lamps, the capture must contain its surface points. With `wanted` = None, AUTOMATIC_FROM decides. Raises
-    UsageError if distillation is requested, but the method does not estimate a confidence, or the capture is too small.
+    Under near lamps, the capture must contain its surface points. With `wanted` = None,
+    AUTOMATIC_FROM decides. Raises UsageError if distillation is requested, but the method does not
+    estimate a confidence, or the capture is too small.
     """
 
     def refuse(problem: str) -> tuple[None, list[CaptureWarning]]:
@@ -109,7 +133,9 @@ def distil_for(
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not estimator.has_confidence:
-        return refuse(f"method {estimator.name} does not provide confidence and cannot be distilled")
+        return refuse(
+            f"method {estimator.name} does not provide confidence and cannot be distilled"
+        )
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
@@ -144,12 +170,14 @@ def estimate_capture(
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
-    """Return the normals of a capture, with all warnings added to it, and the distilled estimator if one was used.
+    """Return the normals of a capture, with all warnings added to it, and the distilled estimator
+    if one was used.
 
-    The capture already contains the warnings from reading it. `check` returns the warnings about its lights and images
-    (diagnosis/checks.py), then `load` the estimator, and `refine_lights` the capture with refined lights. `distil` is
-    as in distil_for. `progress` is called with the number of pixels just estimated. With `strict`, a warning that an
-    input is probably wrong becomes an InputError. The clock times the stages and shows them.
+    The capture already contains the warnings from reading it. `check` returns the warnings about
+    its lights and images (diagnosis/checks.py), then `load` the estimator, and `refine_lights` the
+    capture with refined lights. `distil` is as in distil_for. `progress` is called with the number
+    of pixels just estimated. With `strict`, a warning that an input is probably wrong becomes an
+    InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")
@@ -165,9 +193,14 @@ def estimate_capture(
     estimator = load()
     distilled, found = distil_for(capture, estimator, distil, clock)
     advance = clock.begin("estimate", capture.n_pixels, "estimating")
-    estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, clock=clock)
+    estimate = estimate_normals(
+        capture, distilled or estimator, progress=progress or advance, clock=clock
+    )
     warnings += found
-    warnings += [CaptureWarning(UNTRAINED_LIGHTS, text) for text in estimator.warn_of_lights(capture.n_lights)]
+    warnings += [
+        CaptureWarning(UNTRAINED_LIGHTS, text)
+        for text in estimator.warn_of_lights(capture.n_lights)
+    ]
     # The other warnings explain why the confidence is low.
     if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
@@ -176,28 +209,35 @@ def estimate_capture(
 
 
 def infer_capture(
-    folder: Path, options: InferOptions, observer: Observer = SILENT, *, load: Callable[[], Estimator] | None = None
+    folder: Path,
+    options: InferOptions,
+    observer: Observer = SILENT,
+    *,
+    load: Callable[[], Estimator] | None = None,
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results are written to `options.output`/<capture name>/, replacing earlier ones as new_files does. No other
-    process may write there in the meantime.
+    The results are written to `options.output`/<capture name>/, replacing earlier ones as new_files
+    does. No other process may write there in the meantime.
 
     Args:
-        load: returns `make_method(options)`, which can be reused in a batch to save time. It is called once the capture
-            has been read and checked.
+        load: returns `make_method(options)`, which can be reused in a batch to save time. It is
+            called once the capture has been read and checked.
 
     Raises:
-        InputError: the capture cannot be read, or with options.strict, its lights or images are probably wrong.
+        InputError: the capture cannot be read, or with options.strict, its lights or images are
+            probably wrong.
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
-        OutputError: the results cannot be written, or another process writes into that folder (BusyError).
+        OutputError: the results cannot be written, or another process writes into that folder
+            (BusyError).
 
     Examples:
         >>> from pathlib import Path
         >>> from splinecli.pipeline.infer import infer_capture
         >>> from splinecli.pipeline.infer_options import InferOptions
-        >>> report = infer_capture(Path("examples/medallion"), InferOptions(method="ls", output="results"))
+        >>> report = infer_capture(Path("examples/medallion"), InferOptions(method="ls",
+        output="results"))
         >>> report["n_pixels"]
         11836
     """
@@ -220,7 +260,8 @@ def infer_capture(
             clock=clock,
         )
         for warning in estimate.capture.warnings:
-            once = warning.code if warning.kind is EIGHT_BIT else None  # usual in a batch, and of all its captures
+            # usual in a batch, and of all its captures
+            once = warning.code if warning.kind is EIGHT_BIT else None
             observer.warn(f"{capture.name}: {warning}", once=once)
         estimator = load()
         loaded = None if estimator.weights is None else estimator.weights["sha256"]
@@ -231,19 +272,25 @@ def infer_capture(
             inputs_sha256(source, options.weights, loaded=loaded),
             light_file=source.files.light_directions,
             distillation=None if distilled is None else distilled.report(),
-            alignment=None if source.alignment is None else source.alignment.as_dict(capture.light_indices),
+            alignment=None
+            if source.alignment is None
+            else source.alignment.as_dict(capture.light_indices),
         )
         if source.files.kept is not None:
-            report["light_indices"] = [source.files.kept[index] for index in report["light_indices"]]
+            report["light_indices"] = [
+                source.files.kept[index] for index in report["light_indices"]
+            ]
         found = _make_files(source, estimate, report, options, observer, clock)
         clock.begin("write", note="writing")
         return files.write_estimate(report, target, chain.from_iterable(found), clock)
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
-    """Return a digest that changes if the weight file or any file that is read for the capture changes.
+    """Return a digest that changes if the weight file or any file that is read for the capture
+    changes.
 
-    `loaded` is the SHA-256 of the weight file at the time it was loaded; with None, the file is read.
+    `loaded` is the SHA-256 of the weight file at the time it was loaded; with None, the file is
+    read.
     """
     if weights is not None and (path := expanded(weights)).is_file():
         weights = loaded or file_sha256(path)
@@ -252,7 +299,9 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
-    """Lock the folder for the results of a capture with held_folder, and yield it. Raises OutputError."""
+    """Lock the folder for the results of a capture with held_folder, and yield it. Raises
+    OutputError.
+    """
     target = Path(options.output) / name
     refuse_link(target)
     with held_folder(target, observer.warn):
@@ -262,22 +311,26 @@ def held_results(name: str, options: InferOptions, observer: Observer) -> Iterat
 def make_method(options: InferOptions) -> Estimator:
     """Return the estimator selected by the options. Loading a network takes about a second.
 
-    Raises UsageError if the options require weights or a confidence that the method does not have, or ModelError.
+    Raises UsageError if the options require weights or a confidence that the method does not have,
+    or ModelError.
     """
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:
         raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
     for name in options.maps:
         if MAPS[name].needs_confidence and not estimator.has_confidence:
-            raise UsageError(f"method {options.method} does not provide {name}", hint=f"Leave {name} out of --maps")
+            raise UsageError(
+                f"method {options.method} does not provide {name}",
+                hint=f"Leave {name} out of --maps",
+            )
     return estimator
 
 
 def loads_first(options: InferOptions) -> bool:
     """Return whether the method has to be loaded before a capture is read.
 
-    Its options may be wrong, except for the precision, or the light directions are found in PyTorch, whose number of
-    threads loading sets.
+    Its options may be wrong, except for the precision, or the light directions are found in
+    PyTorch, whose number of threads loading sets.
     """
     chosen = replace(options.method_options, precision="auto") != MethodOptions()
     return chosen or options.method != DEFAULT_METHOD or options.finds_lights
@@ -287,7 +340,9 @@ def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSou
     source = options.open(folder)
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
-        indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
+        indices = draw_lights(
+            source.light_directions, options.n_lights, trials=1, seed=options.seed
+        )[0]
     count = source.n_lights if indices is None else len(indices)
     height, width, *_ = source.facts[0].size[0]
     maps = chosen_maps(options.maps, page=options.html)
@@ -300,7 +355,8 @@ def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSou
         maps=maps,
     )
     clock.expect(seconds(height * width, distils=options.distil))
-    for_mask = source.n_lights * options.auto_mask  # images that are read to find the object, also after aligning
+    # images that are read to find the object, also after aligning
+    for_mask = source.n_lights * options.auto_mask
     advance = clock.begin("read", (count + for_mask) * (1 + options.align), "reading")
     if options.auto_mask:
         source = source.find_mask(lambda: advance(1, "finding the object"))
@@ -313,15 +369,25 @@ def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSou
 
 
 def align(
-    source: CaptureSource, indices: Sequence[int] | None, progress: Callable[[], object] = lambda: None
+    source: CaptureSource,
+    indices: Sequence[int] | None,
+    progress: Callable[[], object] = lambda: None,
 ) -> CaptureSource:
-    """Return the capture with its images aligned, and then with a new automatic mask if it had one."""
+    """Return the capture with its images aligned, and then with a new automatic mask if it had
+    one.
+    """
     aligned = source.align(indices, progress)
-    return aligned if source.automatic_mask is None else replace(aligned, automatic_mask=None).find_mask(progress)
+    return (
+        aligned
+        if source.automatic_mask is None
+        else replace(aligned, automatic_mask=None).find_mask(progress)
+    )
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
-    """Raise InputError, before hours of work, if the results exceed the free memory or the mesh would be empty."""
+    """Raise InputError, before hours of work, if the results exceed the free memory or the mesh
+    would be empty.
+    """
     rows = chosen_maps(options.maps, page=options.html)
     for row in rows:
         row.check_lights(capture.n_lights, folder)
@@ -337,11 +403,15 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 
 
 def _check_light_files(target: Path) -> None:
-    """Raise OutputError if the folder of results contains a light file that was not written by an earlier run."""
+    """Raise OutputError if the folder of results contains a light file that was not written by an
+    earlier run.
+    """
     own = files.own_light_files(target)
     for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
-            problem = "the file is not from an earlier run, and --lights estimate would overwrite it"
+            problem = (
+                "the file is not from an earlier run, and --lights estimate would overwrite it"
+            )
             raise OutputError(problem, path=target / name, hint="Choose another -o")
 
 
@@ -353,7 +423,9 @@ def _make_files(
     observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
-    """Compute the results that the options request, add the surface to the report, and return the files."""
+    """Compute the results that the options request, add the surface to the report, and return the
+    files.
+    """
     capture = estimate.capture
     clock.begin("pictures", note="maps")
     made: dict[str, NDArray[np.float32]] = {}
@@ -371,17 +443,24 @@ def _make_files(
     if "material" in made:
         facts = material_facts(made["material"], capture.mask)
         report["material"] = facts.as_dict()
-        gloss, specular = gloss_picture(made["material"][..., 3:5], capture.mask), made["material"][..., 5]
+        gloss, specular = (
+            gloss_picture(made["material"][..., 3:5], capture.mask),
+            made["material"][..., 5],
+        )
         for warning in material_warnings(facts):
             report["warnings"].append({"code": warning.code, "text": warning.text})
             observer.warn(f"{capture.name}: {warning}")
     scales = dict(options.map_scales)
 
     def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
-        """Yield the files of a map, which is computed when they are written unless it already exists."""
+        """Yield the files of a map, which is computed when they are written unless it already
+        exists.
+        """
         values = made[row.name] if row.name in made else make_map(row, source, estimate)
         if values is not None:
-            yield from map_files(row, values, capture.mask, options.formats, scale=scales.get(row.name))
+            yield from map_files(
+                row, values, capture.mask, options.formats, scale=scales.get(row.name)
+            )
 
     found: list[Iterable[tuple[str, Content]]] = [
         files.normal_files(estimate, options.formats, options.convention),
@@ -389,14 +468,18 @@ def _make_files(
     ]
     light_plot = None
     if capture.light_errors_deg is not None:
-        light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
+        light_plot = sky_plot(
+            capture.light_directions, capture.name, errors_deg=capture.light_errors_deg
+        )
         found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
         advance = clock.begin("surface", note="integrating")
         camera_matrix, pixel_size = view_of_report(report)
-        colours = map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
+        colours = (
+            map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
+        )
         if gloss is not None:  # highlights are not part of the base colour
             colours = base_colour_picture(made["material"][..., :3], capture.mask)
         surface, report["surface"] = make_surface(
@@ -427,8 +510,14 @@ def _make_files(
     return found
 
 
-def results_bytes(n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False) -> int:
-    """Return the memory in bytes that `infer` needs for a capture's results, in addition to its observations."""
+def results_bytes(
+    n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False
+) -> int:
+    """Return the memory in bytes that `infer` needs for a capture's results, in addition to its
+    observations.
+    """
     # The memory of one map is freed before the next is computed.
-    each = [MAPS[name].bytes_per_pixel + MAPS[name].bytes_per_observation * n_lights for name in maps]
+    each = [
+        MAPS[name].bytes_per_pixel + MAPS[name].bytes_per_observation * n_lights for name in maps
+    ]
     return n_pixels * (BYTES_OF_RESULTS + max([*each, BYTES_OF_SURFACE * surface]))

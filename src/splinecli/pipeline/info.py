@@ -38,17 +38,27 @@ ORIGINS = {
 def describe_capture(
     options: InfoOptions, reading: Reading | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
-    """Read a capture without estimating normals, write the plot and the corrected lights, and return the report.
+    """Read a capture without estimating normals, write the plot and the corrected lights, and
+    return the report.
 
-    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also warnings. Raises
-    InputError, OutputError, or UsageError if the plot would be in the folder of the images, or options contradict.
+    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also
+    warnings. Raises InputError, OutputError, or UsageError if the plot would be in the folder of
+    the images, or options contradict.
     """
     reading, plot, mended_lights = reading or Reading(), options.plot, options.mended_lights
-    for name, given in (("--check-lights", options.check_lights), ("--mended-lights", mended_lights is not None)):
+    for name, given in (
+        ("--check-lights", options.check_lights),
+        ("--mended-lights", mended_lights is not None),
+    ):
         if given and reading.finds_lights:
-            raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
+            raise UsageError(
+                f"{name} checks a light file, and --lights estimate reads none",
+                hint="Leave one out",
+            )
     with TemporaryDirectory() as frames:  # extracted from a film
-        source = reading.open(unpacked(options.capture, Path(frames), reading, observer, redo="all"))
+        source = reading.open(
+            unpacked(options.capture, Path(frames), reading, observer, redo="all")
+        )
         common_size(source.facts)  # as in `infer`
         if options.auto_mask:
             with observer.progress("finding the object", source.n_lights) as advance:
@@ -58,7 +68,10 @@ def describe_capture(
                 source = align(source, None, lambda: advance(1))
         if plot is not None:
             if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-                problem = f"the plot {plot} would be in the folder of the images and be read as an image of the capture"
+                problem = (
+                    f"the plot {plot} would be in the folder of the images and be read as an image"
+                    " of the capture"
+                )
                 raise UsageError(problem, hint="Choose another folder for it")
             check_free(plot.parent, [plot.name], overwrite=options.overwrite)
         if mended_lights is not None:
@@ -71,13 +84,20 @@ def describe_capture(
         summary, found_lights = _with_found_lights(summary)
         source = summary.source
         if plot is not None and source.find_lights is not None and found_lights is None:
-            raise InputError("the images differ in size, so there are no lights to plot", path=source.files.folder)
+            raise InputError(
+                "the images differ in size, so there are no lights to plot",
+                path=source.files.folder,
+            )
         if plot is not None:
             errors_deg = None if found_lights is None else found_lights.errors_deg
-            write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
+            write_bytes(
+                plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg)
+            )
         check, warnings = None, summary.warnings()
         if summary.samples is not None:
-            seen = CaptureSample.of_source(source, summary.samples, range(source.n_lights), strict=reading.strict)
+            seen = CaptureSample.of_source(
+                source, summary.samples, range(source.n_lights), strict=reading.strict
+            )
             check, found = check_sample(seen)
             warnings += found
         if found_lights is not None:
@@ -92,7 +112,9 @@ def describe_capture(
         if mended_lights is not None:
             mended = None if check is None or check.odd_image is not None else check.mended
             if mended is not None:
-                write_bytes(mended_lights, encode_lights(mended_lights, mended, source.files.images))
+                write_bytes(
+                    mended_lights, encode_lights(mended_lights, mended, source.files.images)
+                )
             report["mended_lights"] = None if mended is None else str(mended_lights)
         if options.check_lights:
             report["light_candidates"] = [] if check is None else candidate_rows(check)
@@ -112,9 +134,15 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     if report["axis_angle_deg"] is not None:
         nearest, farthest = report["axis_angle_deg"]
         lights = report["light_directions"] or "estimated from the images"
-        angles = f"{nearest:.0f} to {farthest:.0f}" if f"{nearest:.0f}" != f"{farthest:.0f}" else f"{nearest:.0f}"
+        angles = (
+            f"{nearest:.0f} to {farthest:.0f}"
+            if f"{nearest:.0f}" != f"{farthest:.0f}"
+            else f"{nearest:.0f}"
+        )
         lights += f", {angles} degrees from the camera axis"
-    intensities = report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
+    intensities = (
+        report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
+    )
     if estimated is not None and estimated["intensities"] is not None:
         intensities = "estimated from the images"
     exposure, level = report["exposure"], report["white_level"]
@@ -130,16 +158,29 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         *([("reads", report["reads"])] if report["reads"] else []),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),
-        ("white level", f"{level['value']:g}, {ORIGINS[level['origin']]}" if level else "none: floating-point"),
-        ("exposure", f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at most"
-                     f" {100 * exposure['saturated']:.1f} % of an image saturated"),
-        ("expect", f"{report['expect']['memory_mib']} MiB of memory and about {report['expect']['seconds']} s"
-                   f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface"),
-    ]  # fmt: skip
+        (
+            "white level",
+            f"{level['value']:g}, {ORIGINS[level['origin']]}" if level else "none: floating-point",
+        ),
+        (
+            "exposure",
+            f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at"
+            " most"
+            f" {100 * exposure['saturated']:.1f} % of an image saturated",
+        ),
+        (
+            "expect",
+            f"{report['expect']['memory_mib']} MiB of memory and about"
+            f" {report['expect']['seconds']} s"
+            f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface",
+        ),
+    ]
     if "mended_lights" in report:
         nothing = "not written: no other reading of the lights fits clearly better"
         rows.append(("mended", report["mended_lights"] or nothing))
-    return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
+    return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(
+        report.get("light_candidates")
+    )
 
 
 def _camera_in_words(report: dict[str, Any]) -> str | None:
@@ -158,7 +199,10 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     if not candidates:
         return []
     width = max(30, *(len(row["reading"]) + 2 for row in candidates))
-    lines = [f"{'reading of the light file':{width}}{'misfit':>8}{'curl':>8}{'outline':>9}{'advantage':>11}"]
+    lines = [
+        f"{'reading of the light file':{width}}"
+        f"{'misfit':>8}{'curl':>8}{'outline':>9}{'advantage':>11}"
+    ]
     for row in candidates:
         misfit = "-" if row["misfit"] is None else f"{100 * row['misfit']:.0f} %"
         curl, rim, advantage = (
@@ -169,12 +213,15 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     return [
         *lines,
         "misfit: residual of the images, relative to lights in random order; it judges orders",
-        "advantage: evidence from curl and outline, against the file as given; from 1 on it gives a warning",
+        "advantage: evidence from curl and outline, against the file as given; from 1 on it gives"
+        " a warning",
     ]
 
 
 def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
-    """Return the summary with the lights estimated from its sample, and these lights; None if files provide them."""
+    """Return the summary with the lights estimated from its sample, and these lights; None if files
+    provide them.
+    """
     source = summary.source
     if source.find_lights is None or summary.samples is None:
         return summary, None
@@ -189,12 +236,16 @@ def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLi
 def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
     source, files, level = summary.source, summary.source.files, summary.white_level
     channels = None if source.channels is None else CHANNELS
-    kinds = sorted({(*image.shape[1::-1], channels or image.shape[2], image.dtype) for image in summary.images})
+    kinds = sorted(
+        {(*image.shape[1::-1], channels or image.shape[2], image.dtype) for image in summary.images}
+    )
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
     first = summary.images[0]
     size = first.shape[0] * first.shape[1]
-    stages = expected_seconds(summary.n_pixels, len(summary.images), size, align=source.alignment is not None)
+    stages = expected_seconds(
+        summary.n_pixels, len(summary.images), size, align=source.alignment is not None
+    )
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network
     largest = first.shape, np.dtype(first.dtype).itemsize
     memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
@@ -202,15 +253,22 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
     def text(path: Path | None) -> str | None:
         return None if path is None else str(path)
 
-    if intensities is None and source.intensities_measured and (source.light_intensities != 1).any():
+    if (
+        intensities is None
+        and source.intensities_measured
+        and (source.light_intensities != 1).any()
+    ):
         intensities = files.light_directions  # AliceVision's light files contain both
     return {
         "capture": files.name,
         "layout": files.layout,
-        "images": len({image.path for image in summary.images}),  # each is there for every channel that is a light
+        # each is there for every channel that is a light
+        "images": len({image.path for image in summary.images}),
         "first_image": first.path.name,
         "last_image": summary.images[-1].path.name,
-        "image_kinds": [{"size": [w, h], "channels": count, "type": dtype} for w, h, count, dtype in kinds],
+        "image_kinds": [
+            {"size": [w, h], "channels": count, "type": dtype} for w, h, count, dtype in kinds
+        ],
         "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,
         "light_directions": text(files.light_directions),
@@ -219,7 +277,9 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         else {
             "directions": found.directions.round(6).tolist(),
             "errors_deg": found.errors_deg.round(2).tolist(),
-            "intensities": None if found.intensities is None else found.intensities.round(4).tolist(),
+            "intensities": None
+            if found.intensities is None
+            else found.intensities.round(4).tolist(),
         },
         "lamps": None if source.lamps is None else source.lamps.in_words(),
         "camera_matrix": None if source.camera_matrix is None else source.camera_matrix.tolist(),

@@ -48,12 +48,16 @@ from splinecli.system.publishing import held_folder, new_files
 
 
 def view_of_report(
-    report: Mapping[str, Any], camera_matrix: NDArray[np.floating] | None = None, pixel_size_mm: float | None = None
+    report: Mapping[str, Any],
+    camera_matrix: NDArray[np.floating] | None = None,
+    pixel_size_mm: float | None = None,
 ) -> tuple[NDArray[np.float64] | None, float | None]:
-    """Return the camera matrix and the pixel size in millimetres of the normal map described by a report of `infer`.
+    """Return the camera matrix and the pixel size in millimetres of the normal map described by a
+    report of `infer`.
 
-    `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the report. Raises KeyError,
-    TypeError, ValueError or UsageError if the document is not a report from this version of `infer`.
+    `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the
+    report. Raises KeyError, TypeError, ValueError or UsageError if the document is not a report
+    from this version of `infer`.
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
@@ -62,7 +66,8 @@ def view_of_report(
     if lamps is not None and lamps["camera"] == "perspective":
         seen = lamps["camera_matrix"]
     if matrix is None and seen is not None:
-        matrix = np.array(seen, np.float64).reshape(3, 3)  # of the part of the image that the window covers
+        # of the part of the image that the window covers
+        matrix = np.array(seen, np.float64).reshape(3, 3)
     # Without a surface, the pixel size only scaled near lamps, which may be in any unit.
     if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
@@ -72,7 +77,9 @@ def view_of_report(
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Integrate a normal map, write the surface and its report, and return the report. Raises SplinecliError."""
+    """Integrate a normal map, write the surface and its report, and return the report. Raises
+    SplinecliError.
+    """
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
     surface_files.check_exr(options.formats)
@@ -85,7 +92,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
-    convention = options.convention or ("opengl" if made_by is None else made_by["options"]["convention"])
+    convention = options.convention or (
+        "opengl" if made_by is None else made_by["options"]["convention"]
+    )
     normal_map = read_normal_map(path, options.mask, convention=convention)
     mask = np.asarray(normal_map.any(axis=2))
     n_pixels = int(np.count_nonzero(mask))
@@ -97,8 +106,12 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     )
     discontinuity = options.discontinuity
     if discontinuity is None:
-        discontinuity = DISCONTINUITY if made_by is None else float(made_by["options"]["discontinuity"])
-    camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
+        discontinuity = (
+            DISCONTINUITY if made_by is None else float(made_by["options"]["discontinuity"])
+        )
+    camera_matrix = (
+        None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
+    )
     pixel_size = options.pixel_size
     if made_by is not None:
         camera_matrix, pixel_size = view_of_report(made_by, camera_matrix, pixel_size)
@@ -115,7 +128,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         if has_material:
             gloss = _read_picture(of_material[1], mask.shape)
             stored = read_depth(of_material[2], ExpectedSize(mask.shape, "the normal map", "a map"))
-            specular = np.nan_to_num(stored).clip(0, 12.5).astype(np.float32)  # up to full reflection
+            # up to full reflection
+            specular = np.nan_to_num(stored).clip(0, 12.5).astype(np.float32)
     colours = None if picture is None else _read_picture(picture, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
         surface, found = make_surface(
@@ -146,7 +160,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
     }
-    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as new:
+    with new_files(
+        options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)
+    ) as new:
         for name, content in encode_surface(surface, options.formats):
             new.write(name, content)
         if surface.level_normals is not None:
@@ -154,7 +170,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             new.write(LEVEL_PICTURE, encode_png(encode_picture(surface.level_normals, mask)))
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
+        report["files"] = [
+            name for name in options.files if name in new.sizes or name == SURFACE_REPORT
+        ]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     if report["level"] is not None:
         observer.say(f"The surface was levelled by {report['level']['tilt_deg']:.2f} degrees")
@@ -162,17 +180,22 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 
 
 def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H, W)."""
+    """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H,
+    W).
+    """
     image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
     return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     """Return a one-line summary of the files that were written."""
-    unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[report["unit"]]
+    unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[
+        report["unit"]
+    ]
     low, high = report["range"]
     return (
-        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit}, {report['seconds']:.1f} s"
+        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
+        f" {report['seconds']:.1f} s"
     )
 
 
@@ -183,10 +206,14 @@ class _Listing(Struct):
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer` are kept."""
+    """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer`
+    are kept.
+    """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files
-        return [name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
+        return [
+            name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named
+        ]
     except (OSError, ValueError):
         return []
 
@@ -202,11 +229,15 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no whole results of infer: it {error}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
-    raise InputError(problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files")
+    raise InputError(
+        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
+    )
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
-    """Return the report of the `infer` run that wrote a normal map, or None if it has another origin."""
+    """Return the report of the `infer` run that wrote a normal map, or None if it has another
+    origin.
+    """
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:
@@ -217,9 +248,14 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
-        convention, discontinuity = report["options"]["convention"], float(report["options"]["discontinuity"])
+        convention, discontinuity = (
+            report["options"]["convention"],
+            float(report["options"]["discontinuity"]),
+        )
         if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
             return report
-    problem = "is damaged, or from another version: it does not say how the normal map beside it was made"
+    problem = (
+        "is damaged, or from another version: it does not say how the normal map beside it was made"
+    )
     hint = "Run 'splinecli infer' again, or move the normal map to another folder"
     raise InputError(problem, path=path.parent / REPORT, hint=hint)

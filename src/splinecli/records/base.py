@@ -1,7 +1,8 @@
 """Records: frozen options, settings and documents, declared once and checked when they are made.
 
-A field's annotation gives its type, its range (`msgspec.Meta`) and, for an option of a command, an `Option`. The
-command line, the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages follow from it.
+A field's annotation gives its type, its range (`msgspec.Meta`) and, for an option of a command, an
+`Option`. The command line, the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages
+follow from it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,17 @@ from splinecli.errors import SplinecliError, UsageError, check_one_of
 ARGUMENTS = "Arguments"
 # The panels of the help, in order
 PANELS = (
-    *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights", "Light intensities"),
+    *(
+        ARGUMENTS,
+        "Captures",
+        "Input",
+        "Settings",
+        "Pixels",
+        "Scenes",
+        "Length",
+        "Lights",
+        "Light intensities",
+    ),
     *("Method", "Output", "Speed", "Processes and machines"),
 )
 PATH = object()
@@ -41,9 +52,10 @@ Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 class Option:
     """How a field is given on the command line: as `--field-name`, or by `names`.
 
-    panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default: text for a default of
-    None in the help. complete: the values for shell completion, or a function that returns them. parse: converts a text
-    to the field's value, or each text if the option may be `repeated`. items: the names allowed in a list "a,b".
+    panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default:
+    text for a default of None in the help. complete: the values for shell completion, or a function
+    that returns them. parse: converts a text to the field's value, or each text if the option may
+    be `repeated`. items: the names allowed in a list "a,b".
     """
 
     panel: str
@@ -78,12 +90,19 @@ class Option:
 
 
 class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A frozen record of options, whose fields are validated. Raises UsageError for an invalid value."""
+    """A frozen record of options, whose fields are validated. Raises UsageError for an invalid
+    value.
+    """
 
     def __post_init__(self) -> None:
         for name, kind in field_types(type(self)).items():
             option, value = option_of(kind), getattr(self, name)
-            fit(kind, value, f"option {name!r}" if option is None else long_name(name, option), UsageError)
+            fit(
+                kind,
+                value,
+                f"option {name!r}" if option is None else long_name(name, option),
+                UsageError,
+            )
             for item in value if option is not None and option.items else ():
                 check_one_of(name.removesuffix("s"), item, option.items)  # type: ignore[union-attr]
 
@@ -94,16 +113,23 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
         values: dict[str, Any] = to_builtins(self, enc_hook=str)
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in values.items()
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record from the result of `as_dict`. Raises UsageError for an unknown name or an invalid value."""
+        """Return the record from the result of `as_dict`. Raises UsageError for an unknown name or
+        an invalid value.
+        """
         return cls(**settings(cls, values, "option", UsageError))
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """Remove the record's command-line values from `given`, and return the record. Raises UsageError."""
+        """Remove the record's command-line values from `given`, and return the record. Raises
+        UsageError.
+        """
         values: dict[str, Any] = {}
         for name, kind in field_types(cls).items():
             option = option_of(kind)
@@ -114,11 +140,20 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 value = option.value_of(value, title)
                 if (number := number_of(kind)) is not None and option.parse is None:
                     one: Any = Annotated[number, limits(kind)]
-                    items = [fit(one, item, title, UsageError, strict=False) for item in _each(value)]
+                    items = [
+                        fit(one, item, title, UsageError, strict=False) for item in _each(value)
+                    ]
                     value = tuple(items) if option.repeated else items[0]
                 is_name = PATH in _metadata(kind)
-                if (is_name or isinstance(value, Path)) and not option.is_argument and str(value).startswith("-"):
-                    raise UsageError(f"{title} needs a file or folder, found {value}", hint="Name it after the option")
+                if (
+                    (is_name or isinstance(value, Path))
+                    and not option.is_argument
+                    and str(value).startswith("-")
+                ):
+                    raise UsageError(
+                        f"{title} needs a file or folder, found {value}",
+                        hint="Name it after the option",
+                    )
                 values[name] = str(value) if is_name else value
             elif option is not None and option.is_argument and option.repeated:
                 values[name] = ()
@@ -133,20 +168,28 @@ def field_types(record: type) -> dict[str, Any]:
     return {name: hints[name] for name in names}
 
 
-def settings(record: type, values: Mapping[str, Any], noun: str, error: type[SplinecliError]) -> dict[str, Any]:
+def settings(
+    record: type, values: Mapping[str, Any], noun: str, error: type[SplinecliError]
+) -> dict[str, Any]:
     """Convert values from JSON or TOML to the types of the fields of a record or dataclass.
 
-    Raises the given error for an unknown name or an invalid value; `noun` precedes the name in its message.
+    Raises the given error for an unknown name or an invalid value; `noun` precedes the name in its
+    message.
     """
     kinds = field_types(record)
     for name in values:
         if name not in kinds:
             raise error(f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}")
-    return {name: fit(kinds[name], value, f"{noun} {name!r}", error) for name, value in values.items()}
+    return {
+        name: fit(kinds[name], value, f"{noun} {name!r}", error) for name, value in values.items()
+    }
 
 
-def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True) -> Any:
-    """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins with the title.
+def fit(
+    kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True
+) -> Any:
+    """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins
+    with the title.
 
     Unless `strict` is set, numbers may be given as text.
     """
@@ -162,7 +205,9 @@ def fit(kind: Any, value: Any, title: str, error: type[SplinecliError], *, stric
 
 def option_of(kind: Any) -> Option | None:
     """Return how a field of this annotation is given on the command line."""
-    return next((item for item in getattr(kind, "__metadata__", ()) if isinstance(item, Option)), None)
+    return next(
+        (item for item in getattr(kind, "__metadata__", ()) if isinstance(item, Option)), None
+    )
 
 
 def long_name(name: str, option: Option) -> str:
@@ -184,7 +229,9 @@ def _metadata(kind: Any) -> Iterator[Any]:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without annotations; Path for a path that is stored as text, and a list for a tuple."""
+    """Return a type without annotations; Path for a path that is stored as text, and a list for a
+    tuple.
+    """
     if get_origin(kind) is Annotated:
         return Path if PATH in kind.__metadata__ else plain(get_args(kind)[0])
     if get_origin(kind) in (Union, types.UnionType):
@@ -204,10 +251,17 @@ def in_words(kind: Any) -> str:
         whole = "list" if get_origin(bare) is list else "table"
         return f"a {whole}, each {in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
     if bare not in (int, float):
-        return {bool: "true or false", str: "a text", Path: "a text"}.get(bare, "a table of settings")
+        return {bool: "true or false", str: "a text", Path: "a text"}.get(
+            bare, "a table of settings"
+        )
     words, given = "a whole number" if bare is int else "a number", limits(kind)
     lower = "of at least" if given.le is None and given.lt is None else "from"
-    for bound, word in ((given.ge, lower), (given.gt, "above"), (given.le, "to"), (given.lt, "to below")):
+    for bound, word in (
+        (given.ge, lower),
+        (given.gt, "above"),
+        (given.le, "to"),
+        (given.lt, "to below"),
+    ):
         words += "" if bound is None else f" {word} {bound:.10g}"
     return words if given.multiple_of is None else f"{words}, a multiple of {given.multiple_of}"
 
@@ -225,7 +279,9 @@ def number_of(kind: Any) -> type | None:
 
 
 def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the completions of a list "a,b": the typed items, followed by each possible item after the last comma."""
+    """Return the completions of a list "a,b": the typed items, followed by each possible item after
+    the last comma.
+    """
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")

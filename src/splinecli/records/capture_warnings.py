@@ -1,7 +1,8 @@
 """The warnings of a capture: one row of the table for each kind, with a stable code for programs.
 
-A check or a reader creates a warning from its row, with a human-readable sentence. The rows also generate the table in
-docs/warnings.md (docs/make_tables.py), and determine the warnings that `--strict` turns into errors.
+A check or a reader creates a warning from its row, with a human-readable sentence. The rows also
+generate the table in docs/warnings.md (docs/make_tables.py), and determine the warnings that
+`--strict` turns into errors.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ class WarningKind:
 
     code: a name that stays the same when the sentences change.
     meaning, remedy: for the documentation, in Markdown.
-    severity: "error" means that an input is probably wrong; with --strict, the warning becomes an error.
+    severity: "error" means that an input is probably wrong; with --strict, the warning becomes an
+    error.
     """
 
     code: str
@@ -33,8 +35,9 @@ class WarningKind:
 class CaptureWarning:
     """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
-    error_deg: the median angular error of the normals in degrees if the warning is correct. The confidence is lowered
-        accordingly. None if the normals are not affected, or the confidence accounts for the fault in another way.
+    error_deg: the median angular error of the normals in degrees if the warning is correct. The
+        confidence is lowered accordingly. None if the normals are not affected, or the confidence
+        accounts for the fault in another way.
     """
 
     kind: WarningKind
@@ -54,137 +57,288 @@ class CaptureWarning:
 
 
 # The rows form a table: code, meaning, remedy, severity.
-# fmt: off
-AMBIENT_SUBTRACTED = WarningKind("ambient_subtracted", "The image `ambient.*` in the folder was subtracted")
-BLACK_PIXELS = WarningKind("black_pixels", "Over 1 % of the pixels are black under every light",
-    "Use a mask, or a longer exposure")
-CONSTANT_LIGHT = WarningKind("constant_light",
-    "The images look as if they contained [ambient light](input-checks.md#other-interpretations-of-the-images) or a "
-    "black level", "`--ambient IMAGE`, taken with all lamps off", severity="error")
-DARK_IMAGES = WarningKind("dark_images", "The images use a small part of the range", "Use a longer exposure")
-DIFFERENT_SIZES = WarningKind("different_sizes", "The images have different sizes", "Export them in one size")
-DISPLAY_DECODED = WarningKind("display_decoded",
+AMBIENT_SUBTRACTED = WarningKind(
+    "ambient_subtracted", "The image `ambient.*` in the folder was subtracted"
+)
+BLACK_PIXELS = WarningKind(
+    "black_pixels",
+    "Over 1 % of the pixels are black under every light",
+    "Use a mask, or a longer exposure",
+)
+CONSTANT_LIGHT = WarningKind(
+    "constant_light",
+    "The images look as if they contained [ambient"
+    " light](input-checks.md#other-interpretations-of-the-images) or a "
+    "black level",
+    "`--ambient IMAGE`, taken with all lamps off",
+    severity="error",
+)
+DARK_IMAGES = WarningKind(
+    "dark_images", "The images use a small part of the range", "Use a longer exposure"
+)
+DIFFERENT_SIZES = WarningKind(
+    "different_sizes", "The images have different sizes", "Export them in one size"
+)
+DISPLAY_DECODED = WarningKind(
+    "display_decoded",
     "The image files specify a transfer curve, as JPEG files do, and are read with it",
-    "`--transfer linear` if they are linear")
-DISPLAY_ENCODED = WarningKind("display_encoded", "Some images are JPEG or sRGB files, but are read as linear",
-    "`--transfer srgb`; none if they are linear")
-EIGHT_BIT = WarningKind("eight_bit", "The images have 8 bits",
-    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut")
-ESTIMATED_COLOURS = WarningKind("estimated_colours",
+    "`--transfer linear` if they are linear",
+)
+DISPLAY_ENCODED = WarningKind(
+    "display_encoded",
+    "Some images are JPEG or sRGB files, but are read as linear",
+    "`--transfer srgb`; none if they are linear",
+)
+EIGHT_BIT = WarningKind(
+    "eight_bit",
+    "The images have 8 bits",
+    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut",
+)
+ESTIMATED_COLOURS = WarningKind(
+    "estimated_colours",
     "The lamps have different colours, which were estimated and divided out",
-    "RGB intensities with `--intensities FILE` if you measured them")
-ESTIMATED_INTENSITIES = WarningKind("estimated_intensities",
+    "RGB intensities with `--intensities FILE` if you measured them",
+)
+ESTIMATED_INTENSITIES = WarningKind(
+    "estimated_intensities",
     "Light intensities were [estimated](image-preparation.md#estimated-light-intensities)",
-    "`--intensities FILE` if you measured them")
-ESTIMATED_LIGHTS = WarningKind("estimated_lights",
+    "`--intensities FILE` if you measured them",
+)
+ESTIMATED_LIGHTS = WarningKind(
+    "estimated_lights",
     "The light directions were [found from the images](unknown-lights.md)",
-    "Measure the lights if the expected error is too large")
-EXIF_EXPOSURE = WarningKind("exif_exposure", "EXIF states different exposures, by which the images were divided",
-    "Expose all images alike, with exposure and white balance fixed")
-EXIF_ORIENTATION = WarningKind("exif_orientation",
+    "Measure the lights if the expected error is too large",
+)
+EXIF_EXPOSURE = WarningKind(
+    "exif_exposure",
+    "EXIF states different exposures, by which the images were divided",
+    "Expose all images alike, with exposure and white balance fixed",
+)
+EXIF_ORIENTATION = WarningKind(
+    "exif_orientation",
     "An EXIF tag rotates the images in viewers; splinecli uses the stored pixels",
-    "Make mask and lights for the stored pixels")
+    "Make mask and lights for the stored pixels",
+)
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
-GRAY_MATERIAL = WarningKind("gray_material", "With `--maps material`: gray images have no base colour, only brightness")
-GROUND_TRUTH_FRAME = WarningKind("ground_truth_frame",
+GRAY_MATERIAL = WarningKind(
+    "gray_material", "With `--maps material`: gray images have no base colour, only brightness"
+)
+GROUND_TRUTH_FRAME = WarningKind(
+    "ground_truth_frame",
     "The ground truth fits the images only if x or y is negated, or x and y are exchanged",
-    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`", severity="error")
-GROUND_TRUTH_SHIFTED = WarningKind("ground_truth_shifted", "The ground truth fits the images only after a shift",
-    "Align it with the images", severity="error")
-GROUND_TRUTH_UPSIDE_DOWN = WarningKind("ground_truth_upside_down", "The ground truth was upside down and was flipped")
-GROUND_TRUTH_Z = WarningKind("ground_truth_z", "The ground truth points away from the camera", "Negate its z",
-    severity="error")
-IMAGE_INCONSISTENT = WarningKind("image_inconsistent",
+    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`",
+    severity="error",
+)
+GROUND_TRUTH_SHIFTED = WarningKind(
+    "ground_truth_shifted",
+    "The ground truth fits the images only after a shift",
+    "Align it with the images",
+    severity="error",
+)
+GROUND_TRUTH_UPSIDE_DOWN = WarningKind(
+    "ground_truth_upside_down", "The ground truth was upside down and was flipped"
+)
+GROUND_TRUTH_Z = WarningKind(
+    "ground_truth_z",
+    "The ground truth points away from the camera",
+    "Negate its z",
+    severity="error",
+)
+IMAGE_INCONSISTENT = WarningKind(
+    "image_inconsistent",
     "One image [contradicts the others](input-checks.md#one-odd-image)",
-    "Photograph it again, or leave it out with `--light-indices`", severity="error")
-IMAGE_SCALE = WarningKind("image_scale",
-    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit image among "
+    "Photograph it again, or leave it out with `--light-indices`",
+    severity="error",
+)
+IMAGE_SCALE = WarningKind(
+    "image_scale",
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit"
+    " image among "
     "16-bit ones",
-    "Save all images with the same bit depth", severity="error")
-IMAGES_ALIGNED = WarningKind("images_aligned",
-    "The images were [aligned](image-preparation.md#moved-images), as `--align` requests")
-IMAGES_LEFT_OUT = WarningKind("images_left_out",
-    "The light file does not name all images, or some pictures have the name of a mask or map, or another size",
-    "Check names and sizes")
-IMAGES_SHIFTED = WarningKind("images_shifted",
+    "Save all images with the same bit depth",
+    severity="error",
+)
+IMAGES_ALIGNED = WarningKind(
+    "images_aligned",
+    "The images were [aligned](image-preparation.md#moved-images), as `--align` requests",
+)
+IMAGES_LEFT_OUT = WarningKind(
+    "images_left_out",
+    "The light file does not name all images, or some pictures have the name of a mask or map, or"
+    " another size",
+    "Check names and sizes",
+)
+IMAGES_SHIFTED = WarningKind(
+    "images_shifted",
     "Images are [shifted against the others](input-checks.md#shifted-images)",
-    "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod", severity="error")
-LAMP_DISTANCE = WarningKind("lamp_distance", "A lamp is nearer than the object is wide, or hundreds of widths away",
-    "Use one unit for lamps and pixel size", severity="error")
-LIGHT_COLOURS = WarningKind("light_colours",
-    "The lamps have different colours, and some lack a channel, so the colours cannot be divided out",
-    "White lamps, or RGB intensities", severity="error")
-LIGHT_FRAME = WarningKind("light_frame",
-    "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated, or half vectors",
-    "`--light-frame` or `info --mended-lights`, as the warning says", severity="error")
-LIGHT_ORDER = WarningKind("light_order", "The order of the lights probably differs from that of the images",
-    "Correct the light file", severity="error")
-LIGHTS_ILL_CONDITIONED = WarningKind("lights_ill_conditioned", "The lights determine the normals poorly",
-    "Add lights from other sides")
-LIGHTS_IN_CHANNELS = WarningKind("lights_in_channels",
-    "The channels are read as images under three lamps, as `--lights-in-channels` requests; coloured objects get wrong "
+    "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod",
+    severity="error",
+)
+LAMP_DISTANCE = WarningKind(
+    "lamp_distance",
+    "A lamp is nearer than the object is wide, or hundreds of widths away",
+    "Use one unit for lamps and pixel size",
+    severity="error",
+)
+LIGHT_COLOURS = WarningKind(
+    "light_colours",
+    "The lamps have different colours, and some lack a channel, so the colours cannot be divided"
+    " out",
+    "White lamps, or RGB intensities",
+    severity="error",
+)
+LIGHT_FRAME = WarningKind(
+    "light_frame",
+    "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated,"
+    " or half vectors",
+    "`--light-frame` or `info --mended-lights`, as the warning says",
+    severity="error",
+)
+LIGHT_ORDER = WarningKind(
+    "light_order",
+    "The order of the lights probably differs from that of the images",
+    "Correct the light file",
+    severity="error",
+)
+LIGHTS_ILL_CONDITIONED = WarningKind(
+    "lights_ill_conditioned",
+    "The lights determine the normals poorly",
+    "Add lights from other sides",
+)
+LIGHTS_IN_CHANNELS = WarningKind(
+    "lights_in_channels",
+    "The channels are read as images under three lamps, as `--lights-in-channels` requests;"
+    " coloured objects get wrong "
     "normals",
-    "A [crosstalk matrix](coloured-lights.md), and gray objects")
-LIGHTS_MATCHED = WarningKind("lights_matched", "Lights were matched to images by a rule other than the full name",
-    "Check the order of the lights")
-LIGHTS_NEAR_AXIS = WarningKind("lights_near_axis", "All lights are close to the camera axis", "Add lower lights")
-LIGHTS_UNCHECKED = WarningKind("lights_unchecked",
-    "Shadows that the lights should cast are missing; with `--strict`, also if the order or the frame of the "
-    "lights [cannot be checked](input-checks.md#wrong-light-directions)", "Compare bumps and hollows with the object")
-LOW_CONFIDENCE = WarningKind("low_confidence", "The network predicts large errors for nearly all normals",
-    "Check the lights, the mask and the images", severity="error")
-MASK_CHOICE = WarningKind("mask_choice",
-    "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the images, is used as "
-    "the mask; if there are several such pictures, they are ignored", "`--mask FILE` for another one")
-MASK_INVERTED = WarningKind("mask_inverted", "The mask excludes a bright area in the middle",
-    "Invert it: white on the object", severity="error")
-NEAR_LAMPS = WarningKind("near_lamps",
-    "The folder contains lamp positions, or vectors look like positions, but the lights are treated as distant",
-    "`--light-positions FILE`, or leave `--lights` out")
-NEAR_LIGHTS_SUSPECTED = WarningKind("near_lights_suspected",
+    "A [crosstalk matrix](coloured-lights.md), and gray objects",
+)
+LIGHTS_MATCHED = WarningKind(
+    "lights_matched",
+    "Lights were matched to images by a rule other than the full name",
+    "Check the order of the lights",
+)
+LIGHTS_NEAR_AXIS = WarningKind(
+    "lights_near_axis", "All lights are close to the camera axis", "Add lower lights"
+)
+LIGHTS_UNCHECKED = WarningKind(
+    "lights_unchecked",
+    "Shadows that the lights should cast are missing; with `--strict`, also if the order or the"
+    " frame of the "
+    "lights [cannot be checked](input-checks.md#wrong-light-directions)",
+    "Compare bumps and hollows with the object",
+)
+LOW_CONFIDENCE = WarningKind(
+    "low_confidence",
+    "The network predicts large errors for nearly all normals",
+    "Check the lights, the mask and the images",
+    severity="error",
+)
+MASK_CHOICE = WarningKind(
+    "mask_choice",
+    "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the"
+    " images, is used as "
+    "the mask; if there are several such pictures, they are ignored",
+    "`--mask FILE` for another one",
+)
+MASK_INVERTED = WarningKind(
+    "mask_inverted",
+    "The mask excludes a bright area in the middle",
+    "Invert it: white on the object",
+    severity="error",
+)
+NEAR_LAMPS = WarningKind(
+    "near_lamps",
+    "The folder contains lamp positions, or vectors look like positions, but the lights are"
+    " treated as distant",
+    "`--light-positions FILE`, or leave `--lights` out",
+)
+NEAR_LIGHTS_SUSPECTED = WarningKind(
+    "near_lights_suspected",
     "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
-    "[Specify their positions](near-lamps.md)", severity="error")
-NO_MASK = WarningKind("no_mask", "There is no mask that excludes pixels, and most pixels are nearly black",
-    "`--auto-mask`, or a mask")
-NONLINEARITY_SUSPECTED = WarningKind("nonlinearity_suspected",
-    "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read as linear",
-    "`--transfer srgb` or `gamma:2.2`", severity="error")
-NOT_DISTILLED = WarningKind("not_distilled",
+    "[Specify their positions](near-lamps.md)",
+    severity="error",
+)
+NO_MASK = WarningKind(
+    "no_mask",
+    "There is no mask that excludes pixels, and most pixels are nearly black",
+    "`--auto-mask`, or a mask",
+)
+NONLINEARITY_SUSPECTED = WarningKind(
+    "nonlinearity_suspected",
+    "The images [look encoded](input-checks.md#other-interpretations-of-the-images),"
+    " but are read as linear",
+    "`--transfer srgb` or `gamma:2.2`",
+    severity="error",
+)
+NOT_DISTILLED = WarningKind(
+    "not_distilled",
     "A small network could not learn this large capture, so the computation took longer",
-    "none; `--method iw12` is faster")
-PROFILE_UNREAD = WarningKind("profile_unread", "The curve of a colour profile cannot be read",
-    "`--transfer linear`, `srgb` or `gamma:G`")
-REFINED_LIGHTS = WarningKind("refined_lights", "`--refine-lights` moved the light directions",
-    "Compare them with the given directions")
-REFINEMENT_REJECTED = WarningKind("refinement_rejected", "`--refine-lights` found no better directions")
-REPEATED_IMAGES = WarningKind("repeated_images",
-    "Two images are identical, but their lights differ", "Replace one of them",
-    severity="error")
-ROUGH_LIGHTS = WarningKind("rough_lights",
+    "none; `--method iw12` is faster",
+)
+PROFILE_UNREAD = WarningKind(
+    "profile_unread",
+    "The curve of a colour profile cannot be read",
+    "`--transfer linear`, `srgb` or `gamma:G`",
+)
+REFINED_LIGHTS = WarningKind(
+    "refined_lights",
+    "`--refine-lights` moved the light directions",
+    "Compare them with the given directions",
+)
+REFINEMENT_REJECTED = WarningKind(
+    "refinement_rejected", "`--refine-lights` found no better directions"
+)
+REPEATED_IMAGES = WarningKind(
+    "repeated_images",
+    "Two images are identical, but their lights differ",
+    "Replace one of them",
+    severity="error",
+)
+ROUGH_LIGHTS = WarningKind(
+    "rough_lights",
     "Refined light directions would fit the images much better than the given ones",
-    "[`--refine-lights`](infer.md#rough-directions), or measure them again")
-ROUGHNESS_UNDETERMINED = WarningKind("roughness_undetermined",
-    "With `--maps material`: there are too few highlights, or the normals are too uncertain, to [determine the "
-    "roughness](materials.md#limits)", "Add lights, some of them near the camera axis")
-SATURATED = WarningKind("saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure")
-UNEQUAL_INTENSITIES = WarningKind("unequal_intensities",
-    "Light intensities look unequal, but the images do not determine them; or given intensities do not fit the images",
-    "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file", severity="error")
-UNTRAINED_LIGHTS = WarningKind("untrained_lights", "The weights were not trained with this number of lights",
-    "`--n-lights`, other weights, or `--method spline-net`")
-WHITE_LEVEL = WarningKind("white_level",
+    "[`--refine-lights`](infer.md#rough-directions), or measure them again",
+)
+ROUGHNESS_UNDETERMINED = WarningKind(
+    "roughness_undetermined",
+    "With `--maps material`: there are too few highlights, or the normals are too uncertain, to"
+    " [determine the "
+    "roughness](materials.md#limits)",
+    "Add lights, some of them near the camera axis",
+)
+SATURATED = WarningKind(
+    "saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure"
+)
+UNEQUAL_INTENSITIES = WarningKind(
+    "unequal_intensities",
+    "Light intensities look unequal, but the images do not determine them; or given intensities do"
+    " not fit the images",
+    "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
+    severity="error",
+)
+UNTRAINED_LIGHTS = WarningKind(
+    "untrained_lights",
+    "The weights were not trained with this number of lights",
+    "`--n-lights`, other weights, or `--method spline-net`",
+)
+WHITE_LEVEL = WarningKind(
+    "white_level",
     "The images look clipped below full scale, or no value of 16-bit files is above 10 or 12 bits",
-    "`--white-level N` sets another value")
-# fmt: on
+    "`--white-level N` sets another value",
+)
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
-SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
+# share of saturated observations above which the capture, or an image, carries a warning
+SATURATED_SHARE = 0.01
 
 
 def mask_inverted(name: str) -> CaptureWarning:
     """Warn that a mask is probably black on the object."""
-    text = f"{name} excludes a bright area in the middle and keeps its surroundings, so it is probably inverted."
+    text = (
+        f"{name} excludes a bright area in the middle and keeps its surroundings, so it is"
+        " probably inverted."
+    )
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
 
 
@@ -195,9 +349,13 @@ def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
 
 
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
-    """Report that the light directions were estimated from the images, with expected errors (F,) in degrees."""
+    """Report that the light directions were estimated from the images, with expected errors (F,) in
+    degrees.
+    """
     return CaptureWarning(
         ESTIMATED_LIGHTS,
-        f"The light directions were estimated from the images. Their expected error is {errors_deg.mean():.0f} degrees"
-        f" on average and {errors_deg.max():.0f} degrees for the worst one; the normals inherit these errors.",
+        "The light directions were estimated from the images. Their expected error is"
+        f" {errors_deg.mean():.0f} degrees"
+        f" on average and {errors_deg.max():.0f} degrees for the worst one; the normals inherit"
+        " these errors.",
     )

@@ -1,4 +1,6 @@
-"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from them."""
+"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from
+them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ class Document(Struct, kw_only=True, forbid_unknown_fields=True):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
-        values: dict[str, Any] = to_builtins(self, enc_hook=lambda number: number.item())  # of NumPy
+        # of NumPy
+        values: dict[str, Any] = to_builtins(self, enc_hook=lambda number: number.item())
         return values
 
 
@@ -89,7 +92,9 @@ class SurfaceFacts(Document):
 
 
 class AlignmentReport(Document):
-    """How images that moved were aligned: transforms from pixels (x, y, 1) of the reference, and motions in pixels."""
+    """How images that moved were aligned: transforms from pixels (x, y, 1) of the reference, and
+    motions in pixels.
+    """
 
     reference: str
     model: Literal["translation", "similarity", "homography"]
@@ -146,7 +151,9 @@ class EstimateReport(Document):
 class Report(EstimateReport):
     """report.json of infer, and an item of the list of infer --json."""
 
-    seconds: Annotated[dict[str, NotNegative], Meta(extra_json_schema={"required": [*STAGES, "total"]})]
+    seconds: Annotated[
+        dict[str, NotNegative], Meta(extra_json_schema={"required": [*STAGES, "total"]})
+    ]
     folder: str
     files: list[str]
     file_sizes: dict[str, Natural]
@@ -208,10 +215,13 @@ class MethodResult(Document):
 
 
 class ComparisonReport(Document):
-    """Two methods compared trial by trial, on a capture or on the average over the captures, in degrees."""
+    """Two methods compared trial by trial, on a capture or on the average over the captures, in
+    degrees.
+    """
 
-    # With one trial, or if the differences of all trials are equal but not zero, no test is possible, and the last four
-    # are None. If all differences are zero, the interval is (0, 0) and p is 1.
+    # With one trial, or if the differences of all trials are equal but not zero, no test is
+    # possible, and the last four are None. If all differences are zero, the interval is (0, 0) and
+    # p is 1.
     first: str
     second: str
     capture: str
@@ -220,10 +230,12 @@ class ComparisonReport(Document):
     trials: int
     difference_deg: float  # mean over the trials of the errors of `first` minus those of `second`
     std_deg: NotNegative  # population standard deviation of the differences
-    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although nothing differs
+    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although
+    # nothing differs
     interval_deg: tuple[float, float] | None
     p_value: float | None
-    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
+    # p_value corrected for the number of pairs that were tested on this capture
+    p_holm: float | None
     differs: bool | None
 
 
@@ -235,14 +247,18 @@ class SkippedCapture(Document):
 
 
 class Likeness(Document):
-    """How well pictures agree with photographs, over all pixels of the mask and all held-out lights."""
+    """How well pictures agree with photographs, over all pixels of the mask and all held-out
+    lights.
+    """
 
     psnr_db: float  # peak signal-to-noise ratio, relative to white
     error: NotNegative  # mean absolute difference, relative to the mean of the photographs
 
 
 class RelightingReport(Document):
-    """The likeness of pictures of a capture to photographs under the lights that a draw leaves out."""
+    """The likeness of pictures of a capture to photographs under the lights that a draw leaves
+    out.
+    """
 
     capture: str
     method: str
@@ -278,10 +294,13 @@ class Failure(Document):
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of all documents, docs/reports.schema.json."""
-    references, parts = schema_components((Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}")
+    references, parts = schema_components(
+        (Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}"
+    )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Documents of splinecli: report.json, surface.json, results.json, and the document that replaces them"
+        "title": "Documents of splinecli: report.json, surface.json, results.json, and"
+        " the document that replaces them"
         " after a failure",
         "anyOf": list(references),
         "$defs": parts,

@@ -1,7 +1,9 @@
-"""The files that splinecli writes for users: their names, and one row of MAPS for each optional map of `infer`.
+"""The files that splinecli writes for users: their names, and one row of MAPS for each optional map
+of `infer`.
 
-The row determines how the map is computed, written, read, drawn and shown, how much memory it needs, and that its
-pictures are not read as photographs. The functions that make and draw a map are registered by results/map_values.py.
+The row determines how the map is computed, written, read, drawn and shown, how much memory it
+needs, and that its pictures are not read as photographs. The functions that make and draw a map are
+registered by results/map_values.py.
 """
 
 from collections.abc import Sequence
@@ -11,18 +13,32 @@ from pathlib import Path
 from splinecli.errors import InputError
 
 # The file of the normal map in each format
-NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff",
-           "exr": "normals.exr"}  # fmt: skip
+NORMALS = {
+    "png": "normals.png",
+    "png8": "normals_8bit.png",
+    "npy": "normals.npy",
+    "tiff": "normals.tiff",
+    "exr": "normals.exr",
+}
 """The file of the normal map in each format."""
 
 ERROR_MAP, GLOSS = "error_map.png", "metallic_roughness.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-# With the lights estimated by `infer`. If results and capture share a folder, they may be the user's own.
+# With the lights estimated by `infer`. If results and capture share a folder, they may be the
+# user's own.
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
-PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")  # of the other commands
+# of the other commands
+PLOTS = (
+    "calibration.png",
+    "light_noise.png",
+    "contact_sheet.png",
+    "curves.png",
+    "maps.png",
+)
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
-BYTES_OF_SURFACE = 600  # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
+# per pixel of the mask, for integration or for the mesh and its files, whichever needs more
+BYTES_OF_SURFACE = 600
 
 SURFACE_FILES = {
     "glb": ("mesh.glb",),
@@ -34,8 +50,14 @@ SURFACE_FILES = {
     "png": ("depth.png",),
     "exr": ("depth.exr",),
 }
-"""The file names of each format; the pictures are the textures of an OBJ file, if there are colours and a gloss."""
-LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = "level_normals.npy", "level_normals.png"  # of `integrate --level`
+"""The file names of each format; the pictures are the textures of an OBJ file, if there are colours
+and a gloss.
+"""
+# of `integrate --level`
+LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = (
+    "level_normals.npy",
+    "level_normals.png",
+)
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 
 
@@ -50,13 +72,14 @@ class OutputMap:
 
     name: the name in --maps; the file names consist of it and each of the suffixes.
     content: for the documentation. unit: the description of the values in TIFF and EXR files.
-    scale: the value shown as white in the picture by default; scale_text: the description of the scale in the file.
-    caption: below the picture on the page, which shows this map even if --maps does not name it; "" leaves it out.
-    needs_confidence: whether only methods with confidence have it. reads_images: whether it reads the images again.
-    bytes_per_pixel, bytes_per_observation: memory. Maps that need any are computed before the others are written.
-    seconds, seconds_per_pixel: the expected time of a map that takes long, without reading the images.
-    fewest_lights: number of lights below which the map is refused.
-    parts: if the map is written as several maps, their names and channels instead of the above.
+    scale: the value shown as white in the picture by default; scale_text: the description of the
+    scale in the file. caption: below the picture on the page, which shows this map even if --maps
+    does not name it; "" leaves it out. needs_confidence: whether only methods with confidence have
+    it. reads_images: whether it reads the images again. bytes_per_pixel, bytes_per_observation:
+    memory. Maps that need any are computed before the others are written. seconds,
+    seconds_per_pixel: the expected time of a map that takes long, without reading the images.
+    fewest_lights: number of lights below which the map is refused. parts: if the map is written as
+    several maps, their names and channels instead of the above.
     """
 
     name: str
@@ -94,7 +117,9 @@ class OutputMap:
 
 @dataclass(frozen=True)
 class MapPart:
-    """A map that consists of some channels of another one, (H, W) if there is only one, and is written with it."""
+    """A map that consists of some channels of another one, (H, W) if there is only one, and is
+    written with it.
+    """
 
     name: str
     first: int  # channel
@@ -107,39 +132,68 @@ class MapPart:
         return [f"{self.name}.npy"] * self.has_values + [f"{self.name}.png"]
 
 
-# fmt: off
 _ROWS = (
-    OutputMap(name="albedo",
-        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear RGB, up to a factor."
+    # the colours of two images, sums and the map
+    OutputMap(
+        name="albedo",
+        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3,"
+        " linear RGB, up to a factor."
         " The picture is 8-bit sRGB, the EXR file float16",
-        unit="linear RGB", suffixes=("npy", "exr", "png"),
-        caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white", reads_images=True,
-        bytes_per_pixel=52, bytes_per_observation=1),  # the colours of two images, sums and the map
-    OutputMap(name="confidence",
-        content="the probability that a normal has an error of at most 5 degrees; float32, H x W, zero outside the"
+        unit="linear RGB",
+        suffixes=("npy", "exr", "png"),
+        caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
+        reads_images=True,
+        bytes_per_pixel=52,
+        bytes_per_observation=1,
+    ),
+    OutputMap(
+        name="confidence",
+        content="the probability that a normal has an error of at most 5 degrees; float32,"
+        " H x W, zero outside the"
         " mask; white is 1",
         suffixes=("npy", "png"),
-        caption="Confidence: the probability that the normal is at most 5° off, from 0 (black) to 1 (white)",
-        needs_confidence=True),
-    OutputMap(name="preview",
-        content="the surface in matte white under a raking light from the upper left", suffixes=("png",)),
-    OutputMap(name="gradient",
+        caption="Confidence: the probability that the normal is at most 5° off, from 0"
+        " (black) to 1 (white)",
+        needs_confidence=True,
+    ),
+    OutputMap(
+        name="preview",
+        content="the surface in matte white under a raking light from the upper left",
+        suffixes=("png",),
+    ),
+    OutputMap(
+        name="gradient",
         content="the slopes dz/dx and dz/dy; float32, H x W x 2, NaN outside the mask",
-        unit="slopes dz/dx and dz/dy, x right, y up", suffixes=("npy", "tiff")),
-    OutputMap(name="curvature",
-        content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H x W x 2, in 1/pixel"
-        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature: gray is 0, white 0.05 per pixel",
-        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2", scale=0.05,
-        scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel"),
-    OutputMap(name="relief",
-        content="heights without the overall shape; float32, H x W, in pixels, NaN outside the mask. The high-pass"
-        " filter halves the amplitude of 64-pixel wavelengths. In the picture, gray is 0 and white 1 pixel",
-        unit="heights in pixels", scale=1.0,
-        scale_text="height, black -{scale}, gray 0, white {scale} pixels", bytes_per_pixel=BYTES_OF_SURFACE),
+        unit="slopes dz/dx and dz/dy, x right, y up",
+        suffixes=("npy", "tiff"),
+    ),
+    OutputMap(
+        name="curvature",
+        content="mean and Gaussian curvature from the normals, filtered with 2 pixels;"
+        " float32, H x W x 2, in 1/pixel"
+        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature:"
+        " gray is 0, white 0.05 per pixel",
+        unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
+        scale=0.05,
+        scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
+    ),
+    OutputMap(
+        name="relief",
+        content="heights without the overall shape; float32, H x W, in pixels, NaN outside"
+        " the mask. The high-pass"
+        " filter halves the amplitude of 64-pixel wavelengths. In the picture,"
+        " gray is 0 and white 1 pixel",
+        unit="heights in pixels",
+        scale=1.0,
+        scale_text="height, black -{scale}, gray 0, white {scale} pixels",
+        bytes_per_pixel=BYTES_OF_SURFACE,
+    ),
     OutputMap(
         name="material",
-        content="base colour, roughness, metalness, specular reflection and their confidence; float32,"
-        " zero outside the mask. The pictures have 8 bits: base colour in sRGB, and glTF's texture with roughness in"
+        content="base colour, roughness, metalness, specular reflection and their"
+        " confidence; float32,"
+        " zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
+        " and glTF's texture with roughness in"
         " green and metalness in blue",
         reads_images=True,
         bytes_per_pixel=170,  # the maps, and the gloss of each pixel
@@ -157,12 +211,13 @@ _ROWS = (
         ),
     ),
 )
-# fmt: on
 MAPS = {row.name: row for row in _ROWS}
 
 
 def own_files() -> list[str]:
-    """Return the names of all files that `infer` and `integrate` may write to a folder, except FOUND_LIGHTS."""
+    """Return the names of all files that `infer` and `integrate` may write to a folder, except
+    FOUND_LIGHTS.
+    """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)
     return [*NORMALS.values(), ERROR_MAP, *maps, *surface, FOUND_MASK, PAGE, REPORT]

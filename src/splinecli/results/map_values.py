@@ -1,4 +1,6 @@
-"""Functions from the normals and the images of a capture to the values of its maps, registered by the rows of MAPS."""
+"""Functions from the normals and the images of a capture to the values of its maps, registered by
+the rows of MAPS.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture.linearise import StoredPixels, take_pixels
 from splinecli.maths.normals import curvature_of_normals, gradient_of_normals
-from splinecli.pictures.maps import Picture, albedo_picture, confidence_picture, preview_picture, signed_picture
+from splinecli.pictures.maps import (
+    Picture,
+    albedo_picture,
+    confidence_picture,
+    preview_picture,
+    signed_picture,
+)
 from splinecli.surface.integration import relief_of_normals
 
 if TYPE_CHECKING:
@@ -31,8 +39,12 @@ class MapFunctions(NamedTuple):
 MAP_FUNCTIONS: dict[str, MapFunctions] = {}
 
 
-def makes(name: str, picture: Callable[..., Picture], **parts: Callable[..., Picture]) -> Callable[[Make], Make]:
-    """Register a function as the one that makes a row of MAPS, with the pictures of the row and of its parts."""
+def makes(
+    name: str, picture: Callable[..., Picture], **parts: Callable[..., Picture]
+) -> Callable[[Make], Make]:
+    """Register a function as the one that makes a row of MAPS, with the pictures of the row and of
+    its parts.
+    """
 
     def register(make: Make) -> Make:
         for each, function in {name: picture, **parts}.items():
@@ -43,12 +55,16 @@ def makes(name: str, picture: Callable[..., Picture], **parts: Callable[..., Pic
 
 
 @makes("albedo", albedo_picture)
-def albedo(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> NDArray[np.float32]:
+def albedo(
+    source: CaptureSource, estimate: NormalEstimate, progress: Progress
+) -> NDArray[np.float32]:
     return albedo_map(source, estimate.capture, estimate.normal_map, progress)
 
 
 @makes("confidence", confidence_picture)
-def confidence(_: CaptureSource, estimate: NormalEstimate, __: Progress) -> NDArray[np.float32] | None:
+def confidence(
+    _: CaptureSource, estimate: NormalEstimate, __: Progress
+) -> NDArray[np.float32] | None:
     return estimate.confidence_map
 
 
@@ -78,15 +94,18 @@ def albedo_map(
     normal_map: NDArray[np.float32],
     progress: Callable[[], object] = lambda: None,
 ) -> NDArray[np.float32]:
-    """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
+    """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light
+    reaches.
 
-    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
-    the pixel's median of I / (n.l). Its scale is the scale of the images divided by the light intensities, so it is
-    known up to one factor for the whole capture unless the intensities are absolute.
+    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the
+    lights that agree with the pixel's median of I / (n.l). Its scale is the scale of the images
+    divided by the light intensities, so it is known up to one factor for the whole capture unless
+    the intensities are absolute.
 
-    The images of the source are read again, one at a time, for their colours; `progress` is called after each. The
-    capture must have been read from this source; under near lamps, it must contain its surface points. The normal map
-    (H, W, 3) has unit length in its mask. Raises InputError if an image can no longer be read.
+    The images of the source are read again, one at a time, for their colours; `progress` is called
+    after each. The capture must have been read from this source; under near lamps, it must contain
+    its surface points. The normal map (H, W, 3) has unit length in its mask. Raises InputError if
+    an image can no longer be read.
     """
     normals = take_pixels(normal_map, capture.mask)
     counts = np.empty(capture.observations.shape, np.bool_)
@@ -99,8 +118,11 @@ def albedo_map(
         cosine = _shading(capture, normals, slice(None), [position])[0][:, 0] * counts[:, position]
         weight = cosine
         if capture.restored is not None:
-            # The colour of a restored observation is saturated, so only the other observations are used.
-            weight = cosine * np.where(capture.restored[:, position], np.float32(1e-3), np.float32(1))
+            # The colour of a restored observation is saturated, so only the other observations are
+            # used.
+            weight = cosine * np.where(
+                capture.restored[:, position], np.float32(1e-3), np.float32(1)
+            )
         colours *= weight[:, None]  # in place, because large captures need the memory
         total += colours
         squares += weight * cosine
@@ -113,7 +135,9 @@ def albedo_map(
 def colours_of_surface(
     source: CaptureSource, capture: Capture, normals: NDArray[np.float32], progress: Progress
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield the linear RGB values (P, 3) of each image as under a distant white lamp of intensity 1; see albedo_map."""
+    """Yield the linear RGB values (P, 3) of each image as under a distant white lamp of intensity
+    1; see albedo_map.
+    """
     images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
     for position, colours in enumerate(images):
         colours /= _shading(capture, normals, slice(None), [position])[1]
@@ -128,17 +152,25 @@ def colours_of_surface(
 def _shading(
     capture: Capture, normals: NDArray[np.float32], pixels: slice, positions: Sequence[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) for some pixels under K lights, and the lights' attenuation (p, K), or (1, 1) if distant."""
+    """Return n.l (p, K) for some pixels under K lights, and the lights' attenuation (p, K), or (1,
+    1) if distant.
+    """
     if capture.lamps is None:
         lights = capture.light_directions[list(positions)].astype(np.float32)
         return normals[pixels] @ lights.T, np.ones((1, 1), np.float32)
     assert capture.lamps.points is not None
-    directions, attenuation = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[pixels])
+    directions, attenuation = capture.lamps.choose_lights(positions).light_at(
+        capture.lamps.points[pixels]
+    )
     return np.einsum("pfc,pc->pf", directions, normals[pixels]), attenuation
 
 
-def agreeing_lights(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
+def agreeing_lights(
+    observations: NDArray[np.float32], cosine: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine`
+    (P, F) is n.l.
+    """
     lit = cosine > 0.15  # excludes grazing light
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
     # The median of the lit observations, which sorting moves to the front.

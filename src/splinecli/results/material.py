@@ -34,11 +34,14 @@ def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
 
 
 def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
-    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue, linear.
+    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue,
+    linear.
 
     Red is for occlusion in glTF; it is white in the mask.
     """
-    return np.asarray(np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8)
+    return np.asarray(
+        np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8
+    )
 
 
 @makes(
@@ -52,19 +55,28 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
     metallic_roughness=gloss_picture,
 )
 def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
-    """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero outside the mask.
+    """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero
+    outside the mask.
 
     Raises InputError if an image can no longer be read, or there are too few lights.
     """
     normals = take_pixels(estimate.normal_map, estimate.capture.mask)
     found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
     maps = np.zeros((*estimate.capture.mask.shape, 7), np.float32)
-    columns = (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
+    columns = (
+        found.base_colour,
+        found.roughness,
+        found.metalness,
+        found.specular,
+        found.confidence,
+    )
     maps[estimate.capture.mask] = np.column_stack(columns)
     return maps
 
 
-def material_of(estimate: NormalEstimate, colours: Iterable[Float32Array] | None = None) -> MaterialMaps:
+def material_of(
+    estimate: NormalEstimate, colours: Iterable[Float32Array] | None = None
+) -> MaterialMaps:
     """Return the material of a capture; see estimate_material for the arguments and the errors."""
     from splinecli.materials.maps import estimate_material
 
@@ -80,7 +92,8 @@ def material_of(estimate: NormalEstimate, colours: Iterable[Float32Array] | None
 
 
 _CONFIDENT, _LEAST_DETERMINED = 0.5, 0.1
-"""If a smaller share of the pixels has this confidence, the images do not determine the roughness."""
+"""If a smaller share of the pixels has this confidence, the images do not determine the roughness.
+"""
 
 
 def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
@@ -102,9 +115,12 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
         warnings.append(CaptureWarning(GRAY_MATERIAL, text))
     if facts.determined < _LEAST_DETERMINED:
         text = (
-            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have a confidence of"
-            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain. roughness.npy has the most"
-            f" likely values, {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
+            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have"
+            " a confidence of"
+            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain."
+            " roughness.npy has the most"
+            f" likely values, {facts.median_roughness:.2f} in the median. Add lights, some near"
+            " the camera"
             " axis."
         )
         warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
@@ -118,12 +134,17 @@ PAGE_CAPTIONS = {
 
 
 def page_pictures(material: Float32Array) -> dict[str, Picture]:
-    """Return the pictures from which the page draws a material (H, W, 7), by their names in PAGE_CAPTIONS.
+    """Return the pictures from which the page draws a material (H, W, 7), by their names in
+    PAGE_CAPTIONS.
 
-    The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness are linear.
+    The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness
+    are linear.
     """
     from splinecli.materials.lobes import F0_OF_SPECULAR
 
     reflectance = encode_srgb(F0_OF_SPECULAR * material[..., 5:6])
     linear = np.rint(255 * material[..., 3:5].clip(0, 1)).astype(np.uint8)
-    return {"base_colour": encode_srgb(material[..., :3]), "gloss": np.dstack((reflectance, linear))}
+    return {
+        "base_colour": encode_srgb(material[..., :3]),
+        "gloss": np.dstack((reflectance, linear)),
+    }

@@ -1,4 +1,6 @@
-"""HTML pages of results: one with interactive relighting for each capture, and their overview, index.html."""
+"""HTML pages of results: one with interactive relighting for each capture, and their overview,
+index.html.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,14 @@ from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.maths.normals import unit
-from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, Picture, colour_errors, encode_png
+from splinecli.pictures.maps import (
+    PREVIEW_LIGHT,
+    TICKS,
+    TOP_DEG,
+    Picture,
+    colour_errors,
+    encode_png,
+)
 from splinecli.records.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
@@ -31,7 +40,9 @@ def picture_url(file: bytes, kind: str = "png") -> str:
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page rendered from a template and its values. Values are escaped; a missing value is an error."""
+    """Return the page rendered from a template and its values. Values are escaped; a missing value
+    is an error.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -44,9 +55,11 @@ def render(template: str, **values: object) -> str:
     return environment.get_template(template).render(version=__version__, **values).rstrip() + "\n"
 
 
-LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+# pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+LARGEST_MAP = 8_000_000
 LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side length
-LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
+# below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
+LOW_BITS = 5
 _LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # represents a component of 1
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
@@ -63,19 +76,21 @@ def result_page(
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
 
-    Maps that exceed LARGEST_MAP or LONGEST_SIDE are reduced, keeping their aspect ratio, and the page then states the
-    reduced size. A pixel of a reduced map is the mean of the values in its area that are in the mask (or have an
-    error); mean normals are rescaled to unit length. The figures on the page are taken from the report and cover all
-    pixels. Raises OutputError if a picture cannot be encoded.
+    Maps that exceed LARGEST_MAP or LONGEST_SIDE are reduced, keeping their aspect ratio, and the
+    page then states the reduced size. A pixel of a reduced map is the mean of the values in its
+    area that are in the mask (or have an error); mean normals are rescaled to unit length. The
+    figures on the page are taken from the report and cover all pixels. Raises OutputError if a
+    picture cannot be encoded.
 
     Args:
-        report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths on
-            the page are in millimetres if the surface is, otherwise in pixels of the full-size maps.
+        report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths
+            on the page are in millimetres if the surface is, otherwise in pixels of the full-size
+            maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
         values: (H, W) or (H, W, C), by name, for the maps in MAPS that the page shows.
-        material: (H, W, 7), see splinecli.results.material; determines how the page reflects light. None for the albedo
-            and a highlight that the reader sets.
+        material: (H, W, 7), see splinecli.results.material; determines how the page reflects light.
+            None for the albedo and a highlight that the reader sets.
         error_map_deg: (H, W) degrees, NaN where the error is unknown.
         light_plot: a PNG of the lights, if they were estimated from the images.
     """
@@ -84,7 +99,9 @@ def result_page(
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
     error_png, exposure, captions = None, 0.0, {name: MAPS[name].caption for name in values}
     for name, whole in values.items():
-        reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(*shown.shape, *whole.shape[2:])
+        reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(
+            *shown.shape, *whole.shape[2:]
+        )
         maps[name] = map_picture(MAPS[name], reduced, shown)
     if material is not None:
         maps |= page_pictures(_reduce(material, mask, LARGEST_MAP)[0])
@@ -92,7 +109,9 @@ def result_page(
         bright = float(np.quantile(material[mask][:, :3].max(axis=1), 0.99))  # is shown as white
         exposure = round(float(-np.log2(np.clip(bright, 1 / 16, 16))), 1)
     if error_map_deg is not None:
-        values_deg, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
+        values_deg, known = _reduce(
+            error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP
+        )
         error_png = _data_url(colour_errors(np.where(known, values_deg[..., 0], np.nan)))
     first = _first_pictures(maps, normals, shown) if shown.size > 500_000 else {}
     (height, width), size = shown.shape, _size(shown)
@@ -101,14 +120,18 @@ def result_page(
     errors = report["angular_error_deg"] or {}
     words = {"mean": "Mean", "median": "Median", "p90": "90th percentile"}
     figures = [(word, f"{errors[name]:.2f}°") for name, word in words.items() if errors]
-    figures += [(f"Under {limit}°", f"{errors[f'under_{limit}']:.1%}") for limit in (5, 10) if errors]
+    figures += [
+        (f"Under {limit}°", f"{errors[f'under_{limit}']:.1%}") for limit in (5, 10) if errors
+    ]
     millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
         title=report["capture"],
         report=report,
         facts=_facts(report, size if is_reduced else None),
-        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all pixels."
+        reduced=(
+            f"This page shows {size} of the {_size(mask)} pixels. The other files have all pixels."
+        )
         if is_reduced
         else None,
         unit="pixels" if millimetres is None else "mm",
@@ -131,11 +154,12 @@ def result_page(
 
 
 def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[Picture, Picture]:
-    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the LOW_BITS below.
+    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the
+    LOW_BITS below.
 
-    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel that is black in
-    the first picture must be outside, because no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
-    because a browser would multiply the colours by it.
+    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel
+    that is black in the first picture must be outside, because no unit normal is near (-1, -1, -1).
+    The pictures have no alpha channel, because a browser would multiply the colours by it.
     """
     codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
     return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
@@ -144,7 +168,9 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
 def _first_pictures(
     maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
 ) -> dict[str, Picture]:
-    """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads the others."""
+    """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads
+    the others.
+    """
     import cv2
 
     small, known = _reduce(normals, mask, 100_000)
@@ -158,7 +184,8 @@ def _first_pictures(
 def _reduce(
     values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at most LONGEST_SIDE.
+    """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at
+    most LONGEST_SIDE.
 
     A reduced value is the mean of the known values in its area, and is known if one of them is.
     """
@@ -170,8 +197,11 @@ def _reduce(
         return values, known
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
-    channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))  # OpenCV takes up to four
-    total = np.dstack([cv2.resize(channel, size, interpolation=cv2.INTER_AREA) for channel in channels])
+    # OpenCV takes up to four
+    channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))
+    total = np.dstack(
+        [cv2.resize(channel, size, interpolation=cv2.INTER_AREA) for channel in channels]
+    )
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
@@ -181,9 +211,12 @@ def _size(mask: NDArray[np.bool_]) -> str:
 
 
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
-    """Return pairs of terms and values; `reduced` is the size of the page's maps if they were reduced."""
+    """Return pairs of terms and values; `reduced` is the size of the page's maps if they were
+    reduced.
+    """
     weights, expected = report["weights"], report["expected_under_5"]
-    stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]  # up to this page
+    # up to this page
+    stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
     return [
         ("Method", report["method"]),
@@ -191,7 +224,11 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _TIMES.join(map(str, report["image_size"]))),
-        *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
+        *(
+            []
+            if expected is None
+            else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]
+        ),
         *([] if reduced is None else [("Size on this page", reduced)]),
         ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in stages)),
         ("Device", f"{report['device']}, {report['precision']}"),
@@ -218,7 +255,9 @@ class Row(NamedTuple):
     error: str = ""
 
 
-HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error")
+HEADER = Row(
+    "capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error"
+)
 
 
 class Entry(NamedTuple):
@@ -230,10 +269,16 @@ class Entry(NamedTuple):
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Entry:
-        """Return the entry for a report (see report_of), or for a document with `capture` and `error`."""
+        """Return the entry for a report (see report_of), or for a document with `capture` and
+        `error`.
+        """
         if "error" in report:
             return cls(Row(report["capture"], error=report["error"]))
-        errors, expected, seconds = report["angular_error_deg"], report["expected_under_5"], report["seconds"]
+        errors, expected, seconds = (
+            report["angular_error_deg"],
+            report["expected_under_5"],
+            report["seconds"],
+        )
         row = Row(
             report["capture"],
             lights=str(report["n_lights"]),
@@ -243,11 +288,17 @@ class Entry(NamedTuple):
             warnings=str(len(report["warnings"]) or ""),
             seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
         )
-        return cls(row, tuple(report["files"]), tuple(str(warning["text"]) for warning in report["warnings"]))
+        return cls(
+            row,
+            tuple(report["files"]),
+            tuple(str(warning["text"]) for warning in report["warnings"]),
+        )
 
 
 def index_page(entries: Sequence[Entry], output: Path) -> str:
-    """Return the overview page with small normal maps and links to the files, for the folder above the captures."""
+    """Return the overview page with small normal maps and links to the files, for the folder above
+    the captures.
+    """
     rows = []
     for row, files, words in entries:
         # Quote the bytes, because a folder's name may not be valid text.
@@ -258,7 +309,9 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
                 **row._asdict(),
                 "page": f"{folder}/{PAGE}" if PAGE in files else None,
                 "picture": None if picture is None else f"{folder}/{picture}",
-                "thumbnail": None if picture is None else _thumbnail(output / row.capture / picture),
+                "thumbnail": None
+                if picture is None
+                else _thumbnail(output / row.capture / picture),
                 "words": words,
                 "files": [(name, f"{folder}/{quote(name)}") for name in files],
             }
@@ -267,7 +320,8 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if it cannot be read.
+    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if it cannot be
+    read.
 
     This is twice its size on the page, for sharp screens.
     """
@@ -291,7 +345,9 @@ def _thumbnail(path: Path) -> str | None:
 
 
 def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
-    """Return the entries, followed by entries for other captures with results in the folder, sorted by name."""
+    """Return the entries, followed by entries for other captures with results in the folder, sorted
+    by name.
+    """
     names = {entry.row.capture for entry in entries}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
@@ -314,13 +370,18 @@ def has_index(folder: Path) -> bool:
         if not (folder / INDEX).is_file():
             return False
         with (folder / INDEX).open("rb") as file:
-            return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)  # it is near the top
+            # it is near the top
+            return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
     except OSError:
         return False
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if the folder has an index.html that splinecli did not write and may not replace."""
+    """Raise OutputError if the folder has an index.html that splinecli did not write and may not
+    replace.
+    """
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
-        raise OutputError("was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o")
+        raise OutputError(
+            "was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o"
+        )

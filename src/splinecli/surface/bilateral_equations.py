@@ -1,21 +1,25 @@
 """The equations of bilateral normal integration, their weights, and their linear solver.
 
-The unknown is one height h per pixel, in pixels: z itself for an orthographic camera, -f log(depth) for a pinhole
-camera of focal length f. The normal n of a pixel fixes how h changes towards the next pixel on the right and below:
+The unknown is one height h per pixel, in pixels: z itself for an orthographic camera, -f log(depth)
+for a pinhole camera of focal length f. The normal n of a pixel fixes how h changes towards the next
+pixel on the right and below:
 
     facing * (h' - h) + slant = 0,      facing = -n.r,   slant = f n.dr.
 
-Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour. Orthographic rays are all
-(0, 0, -1), and f dr is one pixel.
+Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour.
+Orthographic rays are all (0, 0, -1), and f dr is one pixel.
 
-Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to only one
-neighbour. The method therefore weights the squared residual towards each side by
+Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it
+applies to only one neighbour. The method therefore weights the squared residual towards each side
+by
 
-    share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
+    share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this
+    side^2)).
 
-A side without a neighbour is treated as a gap of zero. In the paper, noise and small errors of the normals change the
-shares, too, so that a continuous surface tears along rows and columns of pixels. Here a share deviates from 1/2 only to
-the extent that the surface contradicts the normal, with r the larger residual of the two sides:
+A side without a neighbour is treated as a gap of zero. In the paper, noise and small errors of the
+normals change the shares, too, so that a continuous surface tears along rows and columns of pixels.
+Here a share deviates from 1/2 only to the extent that the surface contradicts the normal, with r
+the larger residual of the two sides:
 
     1/2 + (share - 1/2) (1 - exp(-(r / CONTRADICTION)^2)).
 """
@@ -35,11 +39,12 @@ from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 
 Pixels = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
-CONTRADICTION = 0.3  # residual that contradicts a normal, such as a frontal one with an error of 17 degrees
+# residual that contradicts a normal, such as a frontal one with an error of 17 degrees
+CONTRADICTION = 0.3
 
-# The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
-# the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and
-# of pixels whose normals face away from the camera.
+# The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a
+# third or more, so the normal says nothing reliable about the height. The equations of the
+# neighbours fix the height of such pixels, and of pixels whose normals face away from the camera.
 SMALLEST_COSINE = 0.05
 
 
@@ -50,12 +55,14 @@ class BilateralEquations:
     facing: Float64Array  # (P,), zero where the normal is not usable
     # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
     slants: tuple[Float64Array, Float64Array]
-    # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
-    # above, and (E,) pixel numbers on the right or below.
+    # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel
+    # numbers on the left or above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
 
     @classmethod
-    def from_normals(cls, normal_map: Floats, mask: Bools, camera_matrix: Floats | None) -> BilateralEquations:
+    def from_normals(
+        cls, normal_map: Floats, mask: Bools, camera_matrix: Floats | None
+    ) -> BilateralEquations:
         """Return the equations of a normal map (H, W, 3) at the pixels of a mask (H, W)."""
         normals = unit(normal_map[mask].astype(np.float64))
         if camera_matrix is None:
@@ -76,18 +83,25 @@ class BilateralEquations:
         slants = (normals @ to_right * usable, normals @ down * usable)
         return cls(facing * usable, slants, (pairs[0], pairs[1]))
 
-    def weigh(self, heights: Float64Array, discontinuity: float) -> tuple[Float64Array, Float64Array]:
+    def weigh(
+        self, heights: Float64Array, discontinuity: float
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the weights of all pairs at the heights (P,), and their flows.
 
-        The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
-        half the first derivative. Pairs along the rows come first, then those along the columns.
+        The weights (E,) are half the second derivative of the sum of squares by the gap of a pair,
+        and the flows (E,) half the first derivative. Pairs along the rows come first, then those
+        along the columns.
         """
         from scipy.special import expit
 
         weights, flows = [], []
         for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
             gap = heights[far] - heights[near]
-            ahead, behind, largest = np.zeros_like(heights), np.zeros_like(heights), np.zeros_like(heights)
+            ahead, behind, largest = (
+                np.zeros_like(heights),
+                np.zeros_like(heights),
+                np.zeros_like(heights),
+            )
             ahead[near], behind[far] = gap, gap
             # Both pixels of a pair have an equation for its gap.
             residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
@@ -106,10 +120,12 @@ class BilateralEquations:
 
 
 class LaplacianSolver:
-    """Solve the normal equations of pairs of neighbours again and again, with other weights each time.
+    """Solve the normal equations of pairs of neighbours again and again, with other weights each
+    time.
 
-    The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients with an algebraic
-    multigrid preconditioner. Its setup costs as much as several solves, so it is kept while the weights stay similar.
+    The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients
+    with an algebraic multigrid preconditioner. Its setup costs as much as several solves, so it is
+    kept while the weights stay similar.
     """
 
     def __init__(self, pairs: tuple[tuple[Pixels, Pixels], ...], n_pixels: int) -> None:
@@ -119,7 +135,8 @@ class LaplacianSolver:
         self._far = np.concatenate([far for _, far in pairs])
         self._n_pixels = n_pixels
         self._preconditioner: Any = None
-        # The matrix always has the same pattern. A matrix of positions records the place of each value.
+        # The matrix always has the same pattern. A matrix of positions records the place of each
+        # value.
         pixels = np.arange(n_pixels, dtype=np.int32)
         rows = np.concatenate((self._near, self._far, pixels))
         columns = np.concatenate((self._far, self._near, pixels))
@@ -135,24 +152,29 @@ class LaplacianSolver:
         pull: Float64Array | float = 0.0,
         distance: Float64Array | float = 0.0,
     ) -> Float64Array:
-        """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
+        """Return the change of heights (P,) that minimises the sum of squares, to a relative
+        residual of `precision`.
 
-        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
-        half the second derivative by the height of each pixel, of the cost that pulls it to a known height, and
-        `distance` (P,) has the heights above these known ones.
+        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the
+        first. `pull` (P,) is half the second derivative by the height of each pixel, of the cost
+        that pulls it to a known height, and `distance` (P,) has the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse import csr_matrix
         from scipy.sparse.linalg import cg
 
-        # Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that
-        # no equation ties to others keep their heights, and the system is never singular.
+        # Small costs on the change of gaps and of heights in one solve; the equations have costs up
+        # to 1. Pixels that no equation ties to others keep their heights, and the system is never
+        # singular.
         weights = weights + 1e-7
         diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
-        matrix = csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
+        matrix = csr_matrix(
+            (values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape
+        )
         if self._preconditioner is None:
-            # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
+            # On these matrices, classical multigrid is faster than smoothed aggregation, both to
+            # set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
         steps = count()
         change: Float64Array
@@ -164,7 +186,9 @@ class LaplacianSolver:
             M=self._preconditioner,
             callback=lambda _: next(steps),
         )
-        if next(steps) > 15:  # above this number of steps, a new preconditioner saves more time than it costs
+        if (
+            next(steps) > 15
+        ):  # above this number of steps, a new preconditioner saves more time than it costs
             self._preconditioner = None
         return change
 

@@ -1,10 +1,11 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
-Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
-where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from another
-source may give the shape at wavelengths above some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently
-combining positions and normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the
-linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
+Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes:
+the surface tears only where it contradicts the normals, and large maps are integrated from coarse
+to fine. A coarse surface from another source may give the shape at wavelengths above some pixels
+(Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and normals for precise
+3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the linear solver. Frame: x
+right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations
@@ -19,13 +20,19 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import Blocks, focal_length
-from splinecli.surface.bilateral_equations import DISCONTINUITY, SMALLEST_COSINE, BilateralEquations, LaplacianSolver
+from splinecli.surface.bilateral_equations import (
+    DISCONTINUITY,
+    SMALLEST_COSINE,
+    BilateralEquations,
+    LaplacianSolver,
+)
 
 _LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
 _STILL = 0.002  # pixels: the rms movement at which the surface is finished
 _COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 _SOLVES_OF_COARSEST = 150
-_LARGEST_VALUE = 1e7  # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
+# of a prior in pixels or millimetres; above it, float32 only represents whole numbers
+_LARGEST_VALUE = 1e7
 RELIEF_WIDTH = 64.0  # pixels: the wavelength at which the high-pass filter halves the amplitude
 
 Progress = Callable[[float], object]  # called with the share of the work that was just done
@@ -41,28 +48,34 @@ def integrate_normals(
     prior_detail: float | None = None,
     progress: Progress = lambda share: None,
 ) -> Float64Array:
-    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
+    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the
+    mask.
 
-    For an orthographic camera, the result is the height towards the camera in pixels. With a camera matrix, it is the
-    positive depth along the viewing axis, of unknown scale. Normals do not fix the offset between parts that share no
-    side of a pixel: each part has mean height 0, or geometric mean depth 1.
+    For an orthographic camera, the result is the height towards the camera in pixels. With a camera
+    matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not fix
+    the offset between parts that share no side of a pixel: each part has mean height 0, or
+        geometric mean depth 1.
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
-        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
-        camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV: columns count to the
-            right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
+        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not
+            zero.
+        camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV:
+            columns count to the right, rows count down, and (0, 0) is the centre of the first
+            pixel. None is an orthographic camera.
         discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
-        prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths like the result, NaN
-            where it is not known. The result has its large-scale shape, its offset and, for depths, its scale.
-        prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer waves follow the
-            prior. None for 15 % of the root of the mask's area.
+        prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths
+            like the result, NaN where it is not known. The result has its large-scale shape, its
+            offset and, for depths, its scale.
+        prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer
+            waves follow the prior. None for 15 % of the root of the mask's area.
         progress: see Progress. The shares may add up to less than 1.
 
     Raises:
         UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
-        InputError: the mask is empty, a normal in the mask is not a unit vector, the camera matrix is not valid, or the
-            prior has no value in the mask, or clearly another direction or unit.
+        InputError: the mask is empty, a normal in the mask is not a unit vector, the camera matrix
+            is not valid, or the prior has no value in the mask, or clearly another direction or
+            unit.
     """
     if not (isfinite(discontinuity) and discontinuity >= 0):
         raise UsageError(f"the discontinuity is {discontinuity:g}, expected a number of at least 0")
@@ -76,9 +89,13 @@ def integrate_normals(
     known = None
     if prior is not None:
         known = _heights_of_prior(prior, mask, camera_matrix)
-        prior_detail = 0.15 * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
+        prior_detail = (
+            0.15 * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
+        )
         if not (isfinite(prior_detail) and prior_detail > 0):
-            raise UsageError(f"the detail of the prior is {prior_detail:g} pixels, expected a positive number")
+            raise UsageError(
+                f"the detail of the prior is {prior_detail:g} pixels, expected a positive number"
+            )
     surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
     if known is not None:
         _check_prior(surface)
@@ -88,12 +105,15 @@ def integrate_normals(
 def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
-    Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
-    unit in the mask, x right, y up, z to the camera, pulled to height zero. The filter's gain at k radians per pixel is
-    k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError if the mask is empty.
+    Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the
+    normals (H, W, 3), unit in the mask, x right, y up, z to the camera, pulled to height zero. The
+    filter's gain at k radians per pixel is k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError
+    if the mask is empty.
     """
     flat = np.zeros(mask.shape)
-    relief = integrate_normals(normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH)
+    relief = integrate_normals(
+        normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH
+    )
     return relief.astype(np.float32)
 
 
@@ -115,7 +135,9 @@ class _Surface(NamedTuple):
         if self.prior is not None:
             values = np.stack((np.nan_to_num(self.prior), np.isfinite(self.prior)), axis=1)
             sums, known = blocks.average(values, self.mask).T
-            prior = np.divide(sums, known * blocks.step, out=np.full(len(sums), np.nan), where=known > 0)
+            prior = np.divide(
+                sums, known * blocks.step, out=np.full(len(sums), np.nan), where=known > 0
+            )
         camera = blocks.shrink_camera(self.camera_matrix)
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
@@ -123,33 +145,39 @@ class _Surface(NamedTuple):
 def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Float64Array:
     """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
 
-    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
-    at the coarsest scale, where many solves take little time. Finer scales follow the edges.
+    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by
+    how much, is found at the coarsest scale, where many solves take little time. Finer scales
+    follow the edges.
     """
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights: Float64Array = np.zeros(n_pixels)
-    # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
-    # Each later solve moves the surface a little further, for which few digits suffice.
+    # At heights of zero all weights are equal, so the first solve is least squares and needs full
+    # precision. Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = 1e-9, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
     is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
     if is_huge or (n_pixels > _COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
-        of_blocks[blocks.mask] = _integrate(coarse, discontinuity, lambda share: progress((1 - own_share) * share))
+        of_blocks[blocks.mask] = _integrate(
+            coarse, discontinuity, lambda share: progress((1 - own_share) * share)
+        )
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights
         precision, most = _LATER_PRECISION, min(20, max(4, 1_000_000 // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
-    # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the same weight.
+    # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the
+    # same weight.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
     known_heights = 0.0 if prior is None else np.nan_to_num(prior)
     for _ in range(most):
         weights, flows = equations.weigh(heights, discontinuity)
-        change = solver.solve(weights, flows, precision=precision, pull=pull, distance=heights - known_heights)
+        change = solver.solve(
+            weights, flows, precision=precision, pull=pull, distance=heights - known_heights
+        )
         heights += change
         progress(own_share / most)
         if precision == _LATER_PRECISION and np.std(change) < _STILL:
@@ -158,11 +186,14 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
     return heights
 
 
-def _normals_of(blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool) -> Float64Array:
-    """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or the steepest one.
+def _normals_of(
+    blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool
+) -> Float64Array:
+    """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or
+    the steepest one.
 
-    With keep_edges, a block that contains an edge has the steepest normal, which belongs to the rim. The mean over an
-    edge would be a slope that joins the two separate sides.
+    With keep_edges, a block that contains an edge has the steepest normal, which belongs to the
+    rim. The mean over an edge would be a slope that joins the two separate sides.
     """
     slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
     mean = unit(blocks.average(slopes, mask))
@@ -180,13 +211,23 @@ def _normals_of(blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edge
 
 
 def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
-    """Return the heights (P,) of a prior in the unit of the equations, NaN where it is not known."""
+    """Return the heights (P,) of a prior in the unit of the equations,
+    NaN where it is not known.
+    """
     if prior.shape != mask.shape:
-        raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape} as in the normal map")
+        raise UsageError(
+            f"the prior has shape {prior.shape}, expected {mask.shape} as in the normal map"
+        )
     heights = prior[mask].astype(np.float64)
-    _refuse(np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE), mask, f"beyond {_LARGEST_VALUE:g}")
+    _refuse(
+        np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE),
+        mask,
+        f"beyond {_LARGEST_VALUE:g}",
+    )
     if camera_matrix is not None:
-        _refuse((heights > 0) & (heights < 1 / _LARGEST_VALUE), mask, f"below {1 / _LARGEST_VALUE:g}")
+        _refuse(
+            (heights > 0) & (heights < 1 / _LARGEST_VALUE), mask, f"below {1 / _LARGEST_VALUE:g}"
+        )
         heights = -focal_length(camera_matrix) * np.log(np.where(heights > 0, heights, np.nan))
     heights[~np.isfinite(heights)] = np.nan
     if np.isnan(heights).all():
@@ -195,19 +236,28 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
 
 
 def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
-    """Raise InputError if any values (P,) of a prior over a mask (H, W) are wrong, with the reason in the message."""
+    """Raise InputError if any values (P,) of a prior over a mask (H, W) are wrong, with the reason
+    in the message.
+    """
     if wrong.any():
         row, column = divmod(int(np.flatnonzero(mask)[wrong.argmax()]), mask.shape[1])
-        problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}, the first in row {row}"
+        problem = (
+            f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}, the first"
+            f" in row {row}"
+        )
         hint = "Give them in the unit of the result, and NaN where nothing is known"
         raise InputError(f"{problem}, column {column}", hint=hint)
 
 
 def _check_prior(surface: _Surface) -> None:
-    """Raise InputError for a prior that is negated, in another unit than the normals, or has values far from others."""
+    """Raise InputError for a prior that is negated, in another unit than the normals, or has values
+    far from others.
+    """
     step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
-    equations = BilateralEquations.from_normals(coarse.normal_map, coarse.mask, coarse.camera_matrix)
+    equations = BilateralEquations.from_normals(
+        coarse.normal_map, coarse.mask, coarse.camera_matrix
+    )
     assert coarse.prior is not None
     slopes, expected = [], []
     for slant, (near, far) in zip(equations.slants, equations.pairs, strict=True):
@@ -222,7 +272,10 @@ def _check_prior(surface: _Surface) -> None:
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
         problem = f"the prior is {steeper:.2g} times as steep as the normals, expected about 1"
-        hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the result"
+        hint = (
+            "Give heights towards the camera, or depths with a camera matrix, in the unit of the"
+            " result"
+        )
         raise InputError(problem, hint=hint)
     assert surface.prior is not None
     farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
@@ -237,12 +290,16 @@ def _depth_map(
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
     offsets = np.bincount(parts, heights) / np.bincount(parts)
-    if prior is not None:  # a part that the prior does not cover has the mean height of the known pixels
+    if (
+        prior is not None
+    ):  # a part that the prior does not cover has the mean height of the known pixels
         is_known = np.bincount(parts, np.isfinite(prior)) > 0
         offsets = np.where(is_known, 0, offsets - np.nanmean(prior))
     heights = heights - offsets[parts]
     depth = np.full(mask.shape, np.nan)
-    depth[mask] = heights if camera_matrix is None else np.exp(-heights / focal_length(camera_matrix))
+    depth[mask] = (
+        heights if camera_matrix is None else np.exp(-heights / focal_length(camera_matrix))
+    )
     return depth
 
 
@@ -250,15 +307,22 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if normal_map.shape != (*mask.shape, 3):
-        raise UsageError(f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this mask")
+        raise UsageError(
+            f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this"
+            " mask"
+        )
     if not mask.any():
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     wrong = mask.copy()
     length = np.linalg.norm(normal_map[mask].astype(np.float64), axis=1)
-    # The tolerance accepts normals from float16 and 8-bit images, and refuses zero vectors. NaN is wrong, too.
+    # The tolerance accepts normals from float16 and 8-bit images, and refuses zero vectors. NaN is
+    # wrong, too.
     wrong[mask] = ~(np.abs(length - 1) <= 1e-2)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
-        problem = f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors, the first in"
+        problem = (
+            f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors,"
+            " the first in"
+        )
         hint = "Leave pixels without a normal out of the mask"
         raise InputError(f"{problem} row {row}, column {column}", hint=hint)

@@ -1,4 +1,6 @@
-"""Level a surface: remove the slope of its main plane, or of a plane through points, from heights and normals."""
+"""Level a surface: remove the slope of its main plane, or of a plane through points, from heights
+and normals.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,12 @@ _AROUND = 2  # pixels around a given point whose median height is taken
 def plane_slopes(
     heights: Floats, points: Sequence[tuple[int, int]] = (), *, aspect: float = 1.0
 ) -> tuple[float, float]:
-    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y is up.
+    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y
+    is up.
 
     Args:
-        points: columns and rows of at least three points on the plane, or () for the dominant plane of the surface
-            (iteratively reweighted least squares with Cauchy's weights).
+        points: columns and rows of at least three points on the plane, or () for the dominant plane
+            of the surface (iteratively reweighted least squares with Cauchy's weights).
         aspect: height of a pixel in widths, the unit of the heights.
 
     Raises:
@@ -31,8 +34,12 @@ def plane_slopes(
     if points:
         values = []
         for x, y in points:
-            around = heights[max(0, y - _AROUND) : y + _AROUND + 1, max(0, x - _AROUND) : x + _AROUND + 1]
-            if not (0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]) or not np.isfinite(heights[y, x]):
+            around = heights[
+                max(0, y - _AROUND) : y + _AROUND + 1, max(0, x - _AROUND) : x + _AROUND + 1
+            ]
+            if not (0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]) or not np.isfinite(
+                heights[y, x]
+            ):
                 raise UsageError(f"the point {x},{y} of --level is not on the object")
             values.append(float(np.nanmedian(around)))
         columns, rows = np.array(points, np.float64).T
@@ -40,10 +47,14 @@ def plane_slopes(
     else:
         rows, columns = np.nonzero(np.isfinite(heights))
         z = heights[rows, columns].astype(np.float64)
-    terms = np.stack((columns - columns.mean(), (rows.mean() - rows) * aspect, np.ones(len(z))), axis=1)
+    terms = np.stack(
+        (columns - columns.mean(), (rows.mean() - rows) * aspect, np.ones(len(z))), axis=1
+    )
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] < 1e-2 * sizes[0]:
-        raise UsageError("the points of --level are in a line", hint="Choose points that span a plane")
+        raise UsageError(
+            "the points of --level are in a line", hint="Choose points that span a plane"
+        )
     weights, right, up = np.ones(len(z)), 0.0, 0.0
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]
@@ -54,8 +65,12 @@ def plane_slopes(
     return right, up
 
 
-def level_heights(heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0) -> Float64Array:
-    """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the object."""
+def level_heights(
+    heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0
+) -> Float64Array:
+    """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the
+    object.
+    """
     rows, columns = np.indices(heights.shape)
     plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)
     return np.asarray(heights - (plane - plane[np.isfinite(heights)].mean()), np.float64)

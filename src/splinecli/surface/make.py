@@ -39,18 +39,25 @@ def make_surface(
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and its entry in the reports.
 
-    The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh. `gloss` (H, W, 3)
-    is glTF's texture of roughness and metalness; with None, the mesh is matte. `specular` (H, W) is 0.5 for a
-    reflectance of 4 %. Without `n_triangles`, the mesh keeps all triangles. `pixel_size_mm` is the width of a pixel on
-    the object and gives a surface in millimetres; with None, the unit is the pixel or, with a camera matrix, the mean
-    depth. The prior is in the unit of the surface. With a camera matrix, a prior is in millimetres, so pixel_size_mm is
-    not needed. `level` is as in plane_slopes, or None; like a height of the pixels other than their width, it raises
-    UsageError with a camera matrix.
+    The arguments and errors are the same as for integrate_normals, surface_mesh and decimated_mesh.
+    `gloss` (H, W, 3) is glTF's texture of roughness and metalness; with None, the mesh is matte.
+    `specular` (H, W) is 0.5 for a reflectance of 4 %. Without `n_triangles`, the mesh keeps all
+    triangles. `pixel_size_mm` is the width of a pixel on the object and gives a surface in
+    millimetres; with None, the unit is the pixel or, with a camera matrix, the mean depth. The
+    prior is in the unit of the surface. With a camera matrix, a prior is in millimetres, so
+    pixel_size_mm is not needed. `level` is as in plane_slopes, or None; like a height of the pixels
+    other than their width, it raises UsageError with a camera matrix.
     """
     if camera_matrix is not None and (level is not None or pixel_aspect != 1):
         option = "--pixel-aspect" if level is None else "--level"
-        hint = "Its fx and fy describe the pixels" if level is None else "Level the mesh in another program"
-        raise UsageError(f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint)
+        hint = (
+            "Its fx and fy describe the pixels"
+            if level is None
+            else "Level the mesh in another program"
+        )
+        raise UsageError(
+            f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint
+        )
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
@@ -71,7 +78,9 @@ def make_surface(
     if n_triangles is None:
         mesh = surface_mesh(*surface, normal_map=normal_map, largest_step=largest_step)
     else:
-        mesh = decimated_mesh(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
+        mesh = decimated_mesh(
+            *surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step
+        )
     if pixel_aspect != 1:
         mesh = replace(mesh, vertices=mesh.vertices * np.array((1, pixel_aspect, 1), np.float32))
     if gloss is not None:
@@ -86,7 +95,8 @@ def make_surface(
     elif pixel_size_mm is not None:
         unit, millimetres, scale = "millimetre", 1.0, pixel_size_mm / pixel
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
-    low, high = (float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax))  # the digits of float32
+    # the digits of float32
+    low, high = (float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax))
     report = SurfaceFacts(
         camera="orthographic" if camera_matrix is None else "perspective",
         unit=unit,
@@ -100,11 +110,16 @@ def make_surface(
     found = report.as_dict()
     if slopes is not None:
         tilt_deg = math.degrees(math.atan(math.hypot(*slopes)))
-        found["level"] = {"slopes": [round(slope, 6) for slope in slopes], "tilt_deg": round(tilt_deg, 4)}
+        found["level"] = {
+            "slopes": [round(slope, 6) for slope in slopes],
+            "tilt_deg": round(tilt_deg, 4),
+        }
     return Surface(depth, mesh, unit, millimetres, level_map), found
 
 
-def _stretched(normal_map: NDArray[np.float32], mask: NDArray[np.bool_], aspect: float) -> NDArray[np.float32]:
+def _stretched(
+    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], aspect: float
+) -> NDArray[np.float32]:
     """Return the normals of a surface that has the same heights on square pixels."""
     stretched = np.zeros_like(normal_map)
     stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))

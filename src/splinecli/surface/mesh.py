@@ -1,13 +1,15 @@
-"""Triangle meshes of height and depth maps, and meshes of fewer triangles, whose normal texture keeps the detail.
+"""Triangle meshes of height and depth maps, and meshes of fewer triangles, whose normal texture
+keeps the detail.
 
-Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera, coordinates are in pixels
-and the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the origin is the
-camera.
+Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera,
+coordinates are in pixels and the origin is the centre of the image. For a pinhole camera, they are
+in the unit of the depth and the origin is the camera.
 
-The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser mesh. A viewer
-interpolates the unit normal N and the tangent T of the vertices over a triangle and scales both to unit length. The
-bitangent is B = N x T, which points up in the image. A texel (x, y, z) then represents the normal x T + y B + z N, and
-its colour is (x + 1) / 2 and so on (glTF 2.0, section 3.9.3).
+The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser
+mesh. A viewer interpolates the unit normal N and the tangent T of the vertices over a triangle and
+scales both to unit length. The bitangent is B = N x T, which points up in the image. A texel (x, y,
+z) then represents the normal x T + y B + z N, and its colour is (x + 1) / 2 and so on (glTF 2.0,
+section 3.9.3).
 """
 
 from collections.abc import Iterator
@@ -33,14 +35,15 @@ class SurfaceMesh:
     # (T, 3) int32, the numbers of three vertices each, counter-clockwise as viewed by the camera
     triangles: NDArray[np.int32]
     normals: Float32Array  # (V, 3) float32, unit
-    # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from 0 at
-    # the top to 1 at the bottom, as in glTF
+    # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the
+    # right, v from 0 at the top to 1 at the bottom, as in glTF
     uvs: Float32Array
     texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
-    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if `normals` are
-    # exact.
+    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if
+    # `normals` are exact.
     normal_texture: NDArray[np.uint8] | None = None
-    # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a matte surface
+    # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a
+    # matte surface
     gloss: NDArray[np.uint8] | None = None
     # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for that everywhere
     specular: Float32Array | None = None
@@ -65,21 +68,24 @@ def surface_mesh(
     normal_map: Floats | None = None,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
+    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by
+    row.
 
-    Four pixels of the mask in a square make two triangles, split along the diagonal whose ends differ less in height.
-    Three make one triangle. Raises UsageError if the largest step is negative.
+    Four pixels of the mask in a square make two triangles, split along the diagonal whose ends
+    differ less in height. Three make one triangle. Raises UsageError if the largest step is
+    negative.
 
     Args:
-        depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix, as
-            integrate_normals returns them.
+        depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix,
+            as integrate_normals returns them.
         mask: (H, W), True on the object.
         camera_matrix: (3, 3), the one that integrate_normals had, or None.
         colours: (H, W, 3) uint8 sRGB, or None.
-        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them from the triangles.
-        largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
-            camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
-            all triangles.
+        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them
+            from the triangles.
+        largest_step: leaves out triangles whose corners differ by more than this in height, in
+            pixels (for a pinhole camera, in pixels at the depth of the triangle). They are the
+            walls where the surface is torn. None keeps all triangles.
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
@@ -116,7 +122,9 @@ def check_triangles(mask: Bools, path: Path) -> None:
         raise no_triangles(path, instead="leave --surface out")
 
 
-def no_triangles(path: Path | None = None, *, instead: str = "leave glb out of the formats") -> InputError:
+def no_triangles(
+    path: Path | None = None, *, instead: str = "leave glb out of the formats"
+) -> InputError:
     """Return the error of a mesh that has none."""
     return InputError(
         "the mesh has no triangles: nowhere do three pixels of the object form a corner",
@@ -139,14 +147,18 @@ def vertex_normals(vertices: Floats, triangles: Integers) -> Float64Array:
 
 
 def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
-    """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see SurfaceMesh.uvs."""
+    """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see
+    SurfaceMesh.uvs.
+    """
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
 
 def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
-    """Return a texture (H, W) or (H, W, 3) in which unknown pixels have the value of the nearest known (H, W) one.
+    """Return a texture (H, W) or (H, W, 3) in which unknown pixels have the value of the nearest
+    known (H, W) one.
 
-    Viewers interpolate between pixels and reduce textures, which would bring in the background at the border.
+    Viewers interpolate between pixels and reduce textures, which would bring in the background at
+    the border.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -160,7 +172,9 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).
-    squares = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1).reshape(-1, 4)
+    squares = np.stack(
+        (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1
+    ).reshape(-1, 4)
     inside = squares >= 0
     whole = squares[inside.all(axis=1)]
     step = np.abs(heights[whole[:, :2]] - heights[whole[:, 2:]])
@@ -172,8 +186,10 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     return np.concatenate(parts)
 
 
-LARGE_MAP = 500_000  # pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
-_OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
+# pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
+LARGE_MAP = 500_000
+# barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
+_OUTSIDE = 1e-6
 
 
 def decimated_mesh(
@@ -186,10 +202,12 @@ def decimated_mesh(
     normal_map: Floats,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal map.
+    """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal
+    map.
 
-    Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface simplification using quadric
-    error metrics, SIGGRAPH 1997). A mesh that has no more triangles is returned as it is.
+    Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface
+    simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no more triangles is
+    returned as it is.
 
     Args:
         depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
@@ -200,17 +218,25 @@ def decimated_mesh(
         UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
-    mesh = _mesh_of_blocks(depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step)
+    mesh = _mesh_of_blocks(
+        depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step
+    )
     if mesh is None:
-        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+        mesh = surface_mesh(
+            depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step
+        )
     if n_triangles >= len(mesh.triangles):
         return mesh
     simplify = import_extra("fast_simplification", "mesh").simplify
     # The thresholds of the library are lengths: give it pixels.
     pixel = 1 if camera_matrix is None else 1 / focal_length(camera_matrix)
-    vertices, triangles = simplify(mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles)
+    vertices, triangles = simplify(
+        mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles
+    )
     if not len(triangles):
-        raise InputError(f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate")
+        raise InputError(
+            f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate"
+        )
     vertices = vertices * pixel
     normals = vertex_normals(vertices, triangles)
     tangents = _tangents(vertices, normals, camera_matrix)
@@ -236,10 +262,12 @@ def _mesh_of_blocks(
     normal_map: Floats,
     largest_step: float | None,
 ) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None if its triangles would be too few, or the map is small.
+    """Return a mesh of blocks of a large map's pixels; None if its triangles would be too few, or
+    the map is small.
 
-    Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels are requested, a mesh
-    of blocks with at least four times the requested number has the same shape, and the normal texture keeps the detail.
+    Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
+    are requested, a mesh of blocks with at least four times the requested number has the same
+    shape, and the normal texture keeps the detail.
     """
     step = int((2 * np.count_nonzero(mask) / (4 * n_triangles)) ** 0.5)
     if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
@@ -267,11 +295,14 @@ def _mesh_of_blocks(
     return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
 
 
-def _tangents(vertices: Float64Array, normals: Float64Array, camera_matrix: Floats | None) -> Float64Array:
-    """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row of the image.
+def _tangents(
+    vertices: Float64Array, normals: Float64Array, camera_matrix: Floats | None
+) -> Float64Array:
+    """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row
+    of the image.
 
-    A row of the image shows the plane that contains the viewing rays of the row. This is how viewers compute tangents
-    themselves (MikkTSpace): the derivative of the position along u.
+    A row of the image shows the plane that contains the viewing rays of the row. This is how
+    viewers compute tangents themselves (MikkTSpace): the derivative of the position along u.
     """
     along = np.array((1.0, 0.0, 0.0)) if camera_matrix is None else ray_basis(camera_matrix)[0]
     rays = np.array((0.0, 0.0, -1.0)) if camera_matrix is None else vertices
@@ -281,19 +312,29 @@ def _tangents(vertices: Float64Array, normals: Float64Array, camera_matrix: Floa
 
 
 def _normal_texture(
-    points: Float64Array, triangles: Integers, normals: Float64Array, tangents: Float64Array, normal_map: Floats
+    points: Float64Array,
+    triangles: Integers,
+    normals: Float64Array,
+    tangents: Float64Array,
+    normal_map: Floats,
 ) -> NDArray[np.uint8]:
-    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
+    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the
+    nearest inside.
 
-    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals`
-    and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
+    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their
+    numbers, `normals` and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)
     on_object = np.asarray(normal_map.any(axis=2))
     for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
         seen = on_object[rows, columns]
-        corners, weights, rows, columns = triangles[number[seen]], weights[seen], rows[seen], columns[seen]
+        corners, weights, rows, columns = (
+            triangles[number[seen]],
+            weights[seen],
+            rows[seen],
+            columns[seen],
+        )
         frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
         texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
         texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
@@ -301,10 +342,16 @@ def _normal_texture(
     return fill_outside(texture, known)
 
 
-def _in_frame(measured: Float64Array, normals: Float64Array, tangents: Float64Array) -> Float64Array:
-    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be perpendicular to N."""
+def _in_frame(
+    measured: Float64Array, normals: Float64Array, tangents: Float64Array
+) -> Float64Array:
+    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be
+    perpendicular to N.
+    """
     bitangents = np.cross(normals, tangents)
-    along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals))
+    along, up, out = (
+        np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals)
+    )
     skew = np.einsum("qx,qx->q", tangents, normals)
     square = np.maximum(1 - skew**2, 1e-6)
     texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
@@ -315,30 +362,42 @@ def _in_frame(measured: Float64Array, normals: Float64Array, tangents: Float64Ar
 def _covered_pixels(
     points: Float64Array, triangles: Integers, shape: tuple[int, ...]
 ) -> Iterator[tuple[NDArray[np.intp], Float64Array, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
+    """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q,
+    3), row, column.
+    """
     for start in range(0, len(triangles), 50_000):
         numbers = np.arange(start, min(start + 50_000, len(triangles)))
         corners = points[triangles[numbers]]
         forms = _barycentric_forms(corners)
         seen = np.isfinite(forms).all(axis=(1, 2))
         numbers, corners, forms = numbers[seen], corners[seen], forms[seen]
-        # The rows of each triangle, and in each row the columns in which all three coordinates are positive.
+        # The rows of each triangle, and in each row the columns in which all three coordinates are
+        # positive.
         first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
         last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
         which, rows = _ranges(first, last)
-        slope, rest = forms[which, :, 0], forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE
+        slope, rest = (
+            forms[which, :, 0],
+            forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE,
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -rest / slope
-        low = np.where(slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)).max(axis=1)
+        low = np.where(
+            slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)
+        ).max(axis=1)
         high = np.where(slope < 0, crossing, np.inf).min(axis=1)
-        span, columns = _ranges(np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1))
+        span, columns = _ranges(
+            np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1)
+        )
         which, rows = which[span], rows[span]
         place = np.stack((columns, rows, np.ones(len(rows))), axis=1)
         yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
 
 
 def _barycentric_forms(corners: Float64Array) -> Float64Array:
-    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
+    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric
+    coordinates.
+    """
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
@@ -349,7 +408,9 @@ def _barycentric_forms(corners: Float64Array) -> Float64Array:
 
 
 def _ranges(first: Float64Array, last: Float64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the whole numbers from each first to its last, and before them the number of the range of each."""
+    """Return the whole numbers from each first to its last, and before them the number of the range
+    of each.
+    """
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)
     within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

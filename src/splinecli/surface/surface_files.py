@@ -1,6 +1,8 @@
-"""The files of a surface: meshes as glTF (GLB), PLY, OBJ and STL; depth maps as float32 NPY, TIFF and EXR, and as PNG.
+"""The files of a surface: meshes as glTF (GLB), PLY, OBJ and STL; depth maps as float32 NPY, TIFF
+and EXR, and as PNG.
 
-The command line needs the names in this file, so everything heavier than NumPy is imported in functions.
+The command line needs the names in this file, so everything heavier than NumPy is imported in
+functions.
 """
 
 from __future__ import annotations
@@ -38,11 +40,15 @@ class Surface:
     mesh: SurfaceMesh  # the mesh of the same surface
     unit: str  # the name of the unit of both
     millimetres: float  # the length of this unit in a file of glTF
-    level_normals: NDArray[np.float32] | None = None  # (H, W, 3), the normals of a surface that was levelled
+    # (H, W, 3), the normals of a surface that was levelled
+    level_normals: NDArray[np.float32] | None = None
 
 
-def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, Content]]:
-    """Yield the name and the content (see NewFiles.write) of each file of a surface; formats are keys of SURFACE_FILES.
+def encode_surface(
+    surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS
+) -> Iterator[tuple[str, Content]]:
+    """Yield the name and the content (see NewFiles.write) of each file of a surface; formats are
+    keys of SURFACE_FILES.
 
     Raises InputError if a mesh without triangles cannot be written as GLB.
     """
@@ -54,7 +60,9 @@ def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -
 
 
 def _encode_glb(surface: Surface) -> bytes:
-    """Encode binary glTF 2.0, in metres: the textures, lit from both sides; matte without a texture of the gloss."""
+    """Encode binary glTF 2.0, in metres: the textures, lit from both sides; matte without a texture
+    of the gloss.
+    """
     import trimesh
     from PIL import Image
 
@@ -65,14 +73,21 @@ def _encode_glb(surface: Surface) -> bytes:
         raise no_triangles()
 
     def add_rest(buffers: Any, tree: Any) -> None:
-        """Add what trimesh lacks. Without the tangents, viewers derive their own tangents in different ways."""
+        """Add what trimesh lacks. Without the tangents, viewers derive their own tangents in
+        different ways.
+        """
         if mesh.specular is not None:
             _add_specular(buffers, tree, mesh.specular)
         if mesh.tangents is None:
             return
         for part in (part for shape in tree["meshes"] for part in shape["primitives"]):
             part["attributes"]["TANGENT"] = len(tree["accessors"])
-        accessor = {"bufferView": len(buffers), "componentType": 5126, "type": "VEC4", "count": len(mesh.tangents)}
+        accessor = {
+            "bufferView": len(buffers),
+            "componentType": 5126,
+            "type": "VEC4",
+            "count": len(mesh.tangents),
+        }
         tree["accessors"]["tangents"] = accessor
         # The last number is the sign of the bitangent.
         buffers["tangents"] = np.insert(mesh.tangents, 3, 1, axis=1).astype("<f4").tobytes()
@@ -88,15 +103,23 @@ def _encode_glb(surface: Surface) -> bytes:
         roughnessFactor=1.0,
         doubleSided=True,
         baseColorFactor=[GRAY] * 3 + [255] if mesh.texture is None else None,
-        **{name: Image.fromarray(picture) for name, picture in textures.items() if picture is not None},
+        **{
+            name: Image.fromarray(picture)
+            for name, picture in textures.items()
+            if picture is not None
+        },
     )
     shown = _trimesh(mesh, _textured(mesh, material), surface.millimetres / 1000)
-    glb: bytes = trimesh.exchange.gltf.export_glb(shown.scene(), include_normals=True, buffer_postprocessor=add_rest)
+    glb: bytes = trimesh.exchange.gltf.export_glb(
+        shown.scene(), include_normals=True, buffer_postprocessor=add_rest
+    )
     return glb
 
 
 def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> None:
-    """Add KHR_materials_specular to a glTF file of one material: the reflectance (H, W) relative to the usual one."""
+    """Add KHR_materials_specular to a glTF file of one material: the reflectance (H, W) relative to
+    the usual one.
+    """
     relative = specular / USUAL_SPECULAR
     largest = float(relative.max())
     if np.abs(relative - 1).max() < 0.01:
@@ -121,20 +144,26 @@ def _encode_texture(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _encode_ply(surface: Surface) -> bytes:
-    """Encode binary PLY, with the normals and colours of the vertices. A comment has the unit's name."""
+    """Encode binary PLY, with the normals and colours of the vertices. A comment has the unit's
+    name.
+    """
     import trimesh
 
     mesh = surface.mesh
-    colours = None if mesh.colours is None else trimesh.visual.ColorVisuals(vertex_colors=mesh.colours)
+    colours = (
+        None if mesh.colours is None else trimesh.visual.ColorVisuals(vertex_colors=mesh.colours)
+    )
     ply: bytes = trimesh.exchange.ply.export_ply(_trimesh(mesh, colours), vertex_normal=True)
     return ply.replace(b" 1.0\n", f" 1.0\ncomment unit: {surface.unit}\n".encode(), 1)
 
 
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
-    """Encode OBJ with normals, texture coordinates and, with colours, textures. A comment has the unit's name.
+    """Encode OBJ with normals, texture coordinates and, with colours, textures. A comment has the
+    unit's name.
 
-    With a gloss, the material has the maps of the extension for physically-based rendering, and Phong's highlight of
-    the same height and about the same width for programs that do not read these maps.
+    With a gloss, the material has the maps of the extension for physically-based rendering, and
+    Phong's highlight of the same height and about the same width for programs that do not read
+    these maps.
     """
     import trimesh
     from PIL import Image
@@ -148,10 +177,14 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
         specular = USUAL_SPECULAR if mesh.specular is None else mesh.specular
         base = decode_transfer(mesh.texture.mean(axis=2) / 255, None)
         square = max(float(roughness.mean()) ** 4, 1e-3)  # of the width of the facets' slopes
-        reflectance = float((0.08 * specular * (1 - metalness) + base * metalness).mean()) / (4 * square)
+        reflectance = float((0.08 * specular * (1 - metalness) + base * metalness).mean()) / (
+            4 * square
+        )
         shininess = 2 / square - 2
     gray = (round(255 * min(reflectance, 1.0)),) * 3
-    material = trimesh.visual.material.SimpleMaterial(image, diffuse, specular=gray, glossiness=shininess, name="mesh")
+    material = trimesh.visual.material.SimpleMaterial(
+        image, diffuse, specular=gray, glossiness=shininess, name="mesh"
+    )
     text, files = trimesh.exchange.obj.export_obj(
         _trimesh(mesh, _textured(mesh, material)),
         include_normals=True,
@@ -160,7 +193,9 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
         header=f"unit: {surface.unit}",
     )
     if mesh.gloss is not None:
-        for place, (name, key) in enumerate((("mesh_roughness.png", "map_Pr"), ("mesh_metalness.png", "map_Pm")), 1):
+        for place, (name, key) in enumerate(
+            (("mesh_roughness.png", "map_Pr"), ("mesh_metalness.png", "map_Pm")), 1
+        ):
             files["mesh.mtl"] += f"\n{key} {name}".encode()
             files[name] = _encode_texture(mesh.gloss[..., place])
     return {"mesh.obj": text.encode(), **files}
@@ -172,7 +207,9 @@ def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
 
     file = io.BytesIO()
     layout = "contig" if values.ndim == 3 else None
-    tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
+    tifffile.imwrite(
+        file, values, photometric="minisblack", planarconfig=layout, description=description
+    )
     return file.getvalue()
 
 
@@ -183,7 +220,8 @@ def _encode_exr(surface: Surface) -> bytes:
 
 
 def _encode_png(surface: Surface) -> bytes:
-    """Encode the depth map as 16-bit gray: 0 outside the object, 1 for the smallest value to 65535 for the largest.
+    """Encode the depth map as 16-bit gray: 0 outside the object, 1 for the smallest value to 65535
+    for the largest.
 
     The text `depth` of the PNG file has these values and their unit.
     """
@@ -201,7 +239,8 @@ def _encode_png(surface: Surface) -> bytes:
 _ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "glb": _encode_glb,
     "ply": _encode_ply,
-    "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),  # binary, with positions alone
+    # binary, with positions alone
+    "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),
     "npy": lambda surface: surface.depth.astype("f4"),
     "tiff": lambda surface: encode_tiff(surface.depth.astype("f4"), f"unit: {surface.unit}"),
     "png": _encode_png,
@@ -213,7 +252,11 @@ def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
     import trimesh
 
     return trimesh.Trimesh(
-        mesh.vertices * np.float32(scale), mesh.triangles, vertex_normals=mesh.normals, visual=visual, process=False
+        mesh.vertices * np.float32(scale),
+        mesh.triangles,
+        vertex_normals=mesh.normals,
+        visual=visual,
+        process=False,
     )
 
 
@@ -225,10 +268,12 @@ def _textured(mesh: SurfaceMesh, material: Any) -> Any:
 
 
 def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:
-    """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its header.
+    """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its
+    header.
 
-    The map is (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these names. Raises
-    UsageError if OpenEXR is not installed, or OutputError if the folder for temporary files cannot be written.
+    The map is (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these
+    names. Raises UsageError if OpenEXR is not installed, or OutputError if the folder for temporary
+    files cannot be written.
     """
     library = import_extra("OpenEXR", "exr")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage, **attributes}
@@ -244,6 +289,8 @@ def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> b
 
 
 def check_exr(formats: Sequence[str]) -> None:
-    """Raise UsageError, before the work, if EXR files are to be written and the library is not installed."""
+    """Raise UsageError, before the work, if EXR files are to be written and the library is not
+    installed.
+    """
     if "exr" in formats:
         import_extra("OpenEXR", "exr")

@@ -48,8 +48,12 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
             with path.open("rb") as file:
                 file.seek(size // 2)  # the first rows of many images are black
                 alike[size, file.read(1 << 12)].append(place)
-    pairs = itertools.chain.from_iterable(itertools.combinations(places, 2) for places in alike.values())
-    return [(one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)]
+    pairs = itertools.chain.from_iterable(
+        itertools.combinations(places, 2) for places in alike.values()
+    )
+    return [
+        (one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)
+    ]
 
 
 def expanded(path: str) -> Path:
@@ -58,7 +62,9 @@ def expanded(path: str) -> Path:
 
 
 def utf8_name(path: Path, file: IO[bytes]) -> str:
-    """Return the path of an open file for a C library; another name if it is not UTF-8, which some crash on."""
+    """Return the path of an open file for a C library; another name if it is not UTF-8, which some
+    crash on.
+    """
     name = str(path.absolute())
     try:
         name.encode()
@@ -75,7 +81,9 @@ def create_hidden(folder: Path) -> IO[bytes]:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[list[Path]]:
-    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are removed again."""
+    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are
+    removed again.
+    """
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -88,10 +96,11 @@ def made_folder(folder: Path) -> Iterator[list[Path]]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a new file that replaces `path` after the block, so that it appears complete or not at all.
+    """Yield a new file that replaces `path` after the block, so that it appears complete or not at
+    all.
 
-    It is written in the same folder and renamed. The rename replaces a link instead of following it. Folders are made
-    as needed. Raises OutputError.
+    It is written in the same folder and renamed. The rename replaces a link instead of following
+    it. Folders are made as needed. Raises OutputError.
     """
     temporary: Path | None = None
     with refusals_as_output_errors(path), made_folder(path.parent) as made:
@@ -114,7 +123,9 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk. Raises OSError."""
+    """Wait until the content of a file, or the names in a folder, are on the disk.
+    Raises OSError.
+    """
     windows = os.name == "nt"
     if windows and path.is_dir():  # Windows cannot open folders
         return
@@ -129,7 +140,9 @@ def sync(path: Path) -> None:
 
 
 def sync_names(folder: Path, *made: Path) -> None:
-    """Wait until the names in a folder and in newly made folders are on the disk. Raises OSError."""
+    """Wait until the names in a folder and in newly made folders are on the disk.
+    Raises OSError.
+    """
     for place in dict.fromkeys((folder, *(new.parent for new in made))):
         sync(place)
 
@@ -140,8 +153,8 @@ Value = TypeVar("Value")
 def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
     """Return the value of a JSON text, such as a record of this kind.
 
-    Raises ValueError, also if it is nested deeply, a number is not finite or no float can hold it, or the value does
-    not fit the kind, with its place.
+    Raises ValueError, also if it is nested deeply, a number is not finite or no float can hold it,
+    or the value does not fit the kind, with its place.
     """
 
     def whole_number(digits: str) -> int:
@@ -155,7 +168,9 @@ def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
         return number
 
     try:
-        read = json.loads(text, parse_int=whole_number, parse_float=finite_number, parse_constant=finite_number)
+        read = json.loads(
+            text, parse_int=whole_number, parse_float=finite_number, parse_constant=finite_number
+        )
         return convert(read, kind)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
@@ -164,12 +179,16 @@ def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
 
 
 def is_special(path: Path) -> bool:
-    """Return whether the path is something other than a file: a folder, a pipe or a device, which might never end."""
+    """Return whether the path is something other than a file: a folder, a pipe or a device, which
+    might never end.
+    """
     return path.exists() and not path.is_file()
 
 
 def read_json(path: Path, kind: type[Value] | Any = Any) -> Value | Any:
-    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it is not a file."""
+    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it
+    is not a file.
+    """
     if is_special(path):
         raise ValueError("it is not a file")
     if path.stat().st_size > _MOST_JSON:
@@ -193,11 +212,14 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
         # NumPy states only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
         kind = NoRoomError if error.errno in (None, *_NO_ROOM) else OutputError
-        raise kind(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
+        raise kind(
+            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
+        ) from error
 
 
 def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
-    """Return our error for an OSError outside refusals_as_output_errors: usually, that a file cannot be read.
+    """Return our error for an OSError outside refusals_as_output_errors: usually, that a file
+    cannot be read.
 
     `path` is named if the error does not name a file.
     """
@@ -222,7 +244,9 @@ def check_writable(folder: Path) -> None:
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise OutputError as check_writable does, or if a folder has one of the named files and not `overwrite`."""
+    """Raise OutputError as check_writable does, or if a folder has one of the named files and not
+    `overwrite`.
+    """
     check_writable(folder)
     for name in () if overwrite else names:
         if (folder / name).exists():
@@ -231,7 +255,9 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Write UTF-8 text as write_bytes does. Characters of file names that are not valid text become escapes."""
+    """Write UTF-8 text as write_bytes does. Characters of file names that are not valid text become
+    escapes.
+    """
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
@@ -240,7 +266,9 @@ StrPath = str | os.PathLike[str]  # a path in any form that the standard library
 
 
 def find_mode(path: Path) -> int | None:
-    """Return the mode (see stat) of the path, following links; None if it does not exist. Raises InputError."""
+    """Return the mode (see stat) of the path, following links; None if it does not exist. Raises
+    InputError.
+    """
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -252,7 +280,8 @@ def find_mode(path: Path) -> int | None:
 
 
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
-    """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
+    """Raise InputError unless there is a file. Anything else, such as a device, might never end or
+    never begin.
 
     With `pipe`, the shell's process substitution `<(...)` is accepted as well, see is_substitution.
     """
@@ -260,7 +289,9 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     if mode is None:
         raise InputError("the file does not exist", path=path)
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
-        raise InputError(f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path)
+        raise InputError(
+            f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path
+        )
 
 
 @contextmanager
@@ -273,9 +304,11 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
 
 
 def is_found_file(path: Path) -> bool:
-    """Return whether an entry of a folder, with the name of a file that is read, is a file; False for a folder.
+    """Return whether an entry of a folder, with the name of a file that is read, is a file; False
+    for a folder.
 
-    Raises InputError for anything else, such as a pipe or a broken link. Skipping it would hide the problem.
+    Raises InputError for anything else, such as a pipe or a broken link. Skipping it would hide the
+    problem.
     """
     if is_folder(path):
         return False
@@ -284,7 +317,9 @@ def is_found_file(path: Path) -> bool:
 
 
 def is_substitution(path: Path) -> bool:
-    """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or standard input."""
+    """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or
+    standard input.
+    """
     try:
         opened = str(path).startswith(("/dev/fd/", "/proc/self/fd/", "/dev/stdin"))
         return opened and stat.S_ISFIFO(path.stat().st_mode)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 # The message for each extra
 _PROBLEMS = {
-    "cluster": "--workers above 1 and --cluster need the package distributed, which is not installed",
+    "cluster": "--workers above 1 and --cluster need the package distributed, which is"
+    " not installed",
     "exr": "EXR files need the package OpenEXR, which is not installed",
     "heif": "HEIC images need the package pillow-heif, which is not installed",
     "mesh": "--decimate needs the package fast-simplification, which is not installed",
@@ -41,18 +42,21 @@ def import_extra(
 ) -> ModuleType:
     """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
 
-    Raises UsageError or `error` if the module is not installed. The message names the command that installs it, the
-    file at `path` that cannot be read without it, and `otherwise`, an alternative.
+    Raises UsageError or `error` if the module is not installed. The message names the command that
+    installs it, the file at `path` that cannot be read without it, and `otherwise`, an alternative.
     """
     try:
         return importlib.import_module(module)
     except ImportError as cause:
         alternative = f", or {otherwise}" if otherwise else ""
-        raise error(_PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}") from cause
+        raise error(
+            _PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
+        ) from cause
 
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
-_GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+# lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+_GROUPS = Path("/proc/self/cgroup")
 _MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it
     ("memory.max", "memory.current", "inactive_file"),  # version 2
@@ -61,17 +65,20 @@ _GROUP_FILES = (  # the limit, the use, and the file cache within it
 
 
 def available_memory() -> float:
-    """Return the number of bytes that this process may still allocate; infinity if the system does not report it.
+    """Return the number of bytes that this process may still allocate; infinity if the system does
+    not report it.
 
-    It is the smallest of the machine's free memory, the limits of the process's control groups, and the limit on its
-    address space (ulimit -v).
+    It is the smallest of the machine's free memory, the limits of the process's control groups, and
+    the limit on its address space (ulimit -v).
     """
     in_groups = map(_left_in_group, own_groups("memory"))
     return min(_free_memory(), _left_in_address_space(), *in_groups)
 
 
 def own_groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups that limit `controller`, cpu or memory, and of those above."""
+    """Yield the folders of this process's control groups that limit `controller`, cpu or memory,
+    and of those above.
+    """
     try:
         lines = _GROUPS.read_text("utf-8").splitlines()
     except OSError:
@@ -84,7 +91,8 @@ def own_groups(controller: str) -> Iterator[Path]:
         if not top.is_dir():
             top = _MOUNT / controller
         folder = top / group.lstrip("/")
-        # Inside a container the path may be the host's, which does not exist here. The top always exists.
+        # Inside a container the path may be the host's, which does not exist here. The top always
+        # exists.
         for place in (folder, *folder.parents):
             yield place
             if place == top:
@@ -92,21 +100,25 @@ def own_groups(controller: str) -> Iterator[Path]:
 
 
 def check_address_space() -> None:
-    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low to load the numerical libraries.
+    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low to load the
+    numerical libraries.
 
     Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
     """
     needed = 1.5e9 + 64 * 2**20 * (os.cpu_count() or 1)
     if (most := _address_space_limit()) < needed:
         limit = f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v)"
-        raise SplinecliError(f"{limit}, but at least {needed / 1e9:.1f} GB are needed", hint="Raise the limit")
+        raise SplinecliError(
+            f"{limit}, but at least {needed / 1e9:.1f} GB are needed", hint="Raise the limit"
+        )
 
 
 def keep_freed_memory() -> None:
     """Let the C library keep freed blocks for the next arrays, if it is glibc.
 
-    By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
-    third of the time of networks and of reading. Blocks above 128 MiB are still returned.
+    By default it returns large blocks to the system, which then clears new pages for every array.
+    That takes about a third of the time of networks and of reading. Blocks above 128 MiB are still
+    returned.
     """
     mallopt = _of_c_library("mallopt")
     mallopt(-3, 2**27)  # M_MMAP_THRESHOLD of malloc.h: the largest block that is kept
@@ -114,12 +126,16 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Return freed blocks to the system between two stages, if the C library is glibc; see keep_freed_memory."""
+    """Return freed blocks to the system between two stages, if the C library is glibc; see
+    keep_freed_memory.
+    """
     _of_c_library("malloc_trim")(0)
 
 
 def _of_c_library(name: str) -> Callable[..., object]:
-    """Return a function of the C library, or one that does nothing if the library lacks this name."""
+    """Return a function of the C library, or one that does nothing if the library lacks this
+    name.
+    """
     try:
         import ctypes
 
@@ -134,7 +150,8 @@ def _free_memory() -> float:
 
 
 def _left_in_group(folder: Path) -> float:
-    """Return the bytes left under the limit of a control group. The group's file cache can be freed.
+    """Return the bytes left under the limit of a control group. The group's file cache can be
+    freed.
 
     Without a limit it is infinity or, in version 1, a huge number.
     """
@@ -169,9 +186,17 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a library."""
+    """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a
+    library.
+    """
     text, of_library = str(error).lower(), isinstance(error, OSError | RuntimeError | ImportError)
-    known = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
+    known = (
+        "allocate memory",
+        "out of memory",
+        "not enough memory",
+        "failed to map segment",
+        "start new thread",
+    )
     return isinstance(error, MemoryError) or (of_library and any(words in text for words in known))
 
 
@@ -180,7 +205,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def choose_device(name: Device | str) -> torch.device:
-    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises UsageError."""
+    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises
+    UsageError.
+    """
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
     import torch
@@ -192,7 +219,9 @@ def choose_device(name: Device | str) -> torch.device:
 
 
 def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
-    """Return the number format of this name; "auto" is bfloat16 if the device supports it natively."""
+    """Return the number format of this name; "auto" is bfloat16 if the device supports it
+    natively.
+    """
     if name != "auto":
         return name
     import torch
@@ -208,9 +237,10 @@ def choose_precision(name: Precision, device: torch.device) -> Literal["float32"
 def use_available_cores() -> None:
     """Limit PyTorch's threads to the cores that this process may use.
 
-    Call it once before a long computation. PyTorch starts one thread per core of the machine, even if a container may
-    use fewer cores. The threads then share the cores, and each step waits for the slowest. The number is only ever
-    lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
+    Call it once before a long computation. PyTorch starts one thread per core of the machine, even
+    if a container may use fewer cores. The threads then share the cores, and each step waits for
+    the slowest. The number is only ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep
+    their effect.
     """
     import torch
 
@@ -221,8 +251,8 @@ def use_available_cores() -> None:
 def count_available_cores() -> int:
     """Return the number of cores that this process may use, at least 1.
 
-    It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its control group, which
-    containers and job schedulers set (Linux).
+    It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its
+    control group, which containers and job schedulers set (Linux).
     """
     limits = [os.cpu_count() or 1, *cgroup_quotas()]
     if hasattr(os, "sched_getaffinity"):
@@ -231,14 +261,18 @@ def count_available_cores() -> int:
 
 
 def cgroup_quotas() -> list[float]:
-    """Return the CPU quotas, in cores, of this process's control groups and of the groups above them."""
+    """Return the CPU quotas, in cores, of this process's control groups and of the groups above
+    them.
+    """
     quotas = []
     for folder in own_groups("cpu"):
-        # Quota and period in microseconds: in one file of version 2, or in two of version 1. The first is "max" or -1
-        # without a quota.
+        # Quota and period in microseconds: in one file of version 2, or in two of version 1. The
+        # first is "max" or -1 without a quota.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
-                quota, period = " ".join((folder / name).read_text("utf-8") for name in names).split()
+                quota, period = " ".join(
+                    (folder / name).read_text("utf-8") for name in names
+                ).split()
                 quotas += [] if quota in ("max", "-1") else [float(quota) / float(period)]
     return quotas
 
@@ -250,16 +284,17 @@ _lock, _users, _threads = Lock(), 0, 0
 
 @contextmanager
 def one_thread_each() -> Iterator[int]:
-    """Let each operation of PyTorch use one thread only. Yields the number of threads that it used before.
+    """Let each operation of PyTorch use one thread only. Yields the number of threads that it used
+    before.
 
-    More threads hardly speed up operations on small arrays, and on a busy machine make them many times slower, because
-    all threads of an operation wait for the slowest.
+    More threads hardly speed up operations on small arrays, and on a busy machine make them many
+    times slower, because all threads of an operation wait for the slowest.
     """
     import torch
 
     global _users, _threads
-    # Each thread has its own number, and new ones have the number that was set last. So the first of several callers
-    # reads it for all, and each sets it in its own thread.
+    # Each thread has its own number, and new ones have the number that was set last. So the first
+    # of several callers reads it for all, and each sets it in its own thread.
     with _lock:
         if not _users:
             _threads = torch.get_num_threads()
@@ -280,7 +315,8 @@ def in_order(
     threads: int = 1,
     start: Callable[[], object] | None = None,
 ) -> Iterator[Result]:
-    """Yield function(part) of each part, in order, computed on so many threads, each of which calls `start` first.
+    """Yield function(part) of each part, in order, computed on so many threads, each of which calls
+    `start` first.
 
     At most one result more than there are threads is kept. An error is raised when its part is due.
     """
@@ -299,13 +335,16 @@ def in_order(
 
 @contextmanager
 def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
-    """Start function() on another thread, and yield a callable that waits for its result or raises its error."""
+    """Start function() on another thread, and yield a callable that waits for its result or raises
+    its error.
+    """
     with ThreadPoolExecutor(1, "meanwhile") as pool:
         yield pool.submit(function).result
 
 
 def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
-    """Yield function(part) of each part as in_order does, without gradients, on as many threads as PyTorch uses.
+    """Yield function(part) of each part as in_order does, without gradients, on as many threads as
+    PyTorch uses.
 
     Within the function, each operation of PyTorch uses one thread.
     """
@@ -313,4 +352,6 @@ def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> I
 
     with one_thread_each() as threads:
         # Each new thread has the number of threads of OpenMP, until PyTorch sets its own.
-        yield from in_order(torch.inference_mode()(function), parts, threads, lambda: torch.set_num_threads(1))
+        yield from in_order(
+            torch.inference_mode()(function), parts, threads, lambda: torch.set_num_threads(1)
+        )

@@ -5,15 +5,27 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
-Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished
+# a function that is called with the number of pixels that were just finished
+Progress = Callable[[int], object]
 
 
 def ignore(*_: object, **__: object) -> None:
     """Show no progress."""
 
 
-# The stages in order, except for page.html, which is one of the pictures but is written after the surface
-STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
+# The stages in order, except for page.html, which is one of the pictures but is written after the
+# surface
+STAGES = (
+    "read",
+    "check",
+    "distil",
+    "estimate",
+    "indirect_light",
+    "refine",
+    "pictures",
+    "surface",
+    "write",
+)
 
 
 class Advance(Protocol):
@@ -75,7 +87,9 @@ class Clock:
 
 
 class Observer:
-    """Receives messages, warnings and progress, and ignores them. A subclass overrides what it shows."""
+    """Receives messages, warnings and progress, and ignores them. A subclass overrides what it
+    shows.
+    """
 
     def say(self, message: str) -> None:
         """Receive a message for the user."""
@@ -87,11 +101,16 @@ class Observer:
         """
 
     def error(self, message: str) -> None:
-        """Receive an error: one of several inputs cannot be used, and the work goes on without it."""
+        """Receive an error: one of several inputs cannot be used,
+        and the work goes on without it.
+        """
 
     @contextmanager
-    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
-        """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps.
+    def progress(
+        self, label: str, total: float, *, start: float = 0.0, unit: str = ""
+    ) -> Iterator[Advance]:
+        """Begin a stage of `total` steps, of which `start` are done. Yields the function that
+        counts steps.
 
         `unit` is the name of a step, such as pixels, if the number per second is informative.
         """

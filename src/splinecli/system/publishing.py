@@ -1,9 +1,10 @@
 """Sets of output files, in folders that one process at a time writes into.
 
-Each new file is written under a random hidden name and synced. When all are complete, the earlier report is removed,
-then the earlier files, the new ones are renamed to their places, and the new report comes last. So a folder with a
-report is complete. A folder without one is unfinished, and its work is repeated. A later process never acts on
-instructions in a folder, and never follows a link in it.
+Each new file is written under a random hidden name and synced. When all are complete, the earlier
+report is removed, then the earlier files, the new ones are renamed to their places, and the new
+report comes last. So a folder with a report is complete. A folder without one is unfinished, and
+its work is repeated. A later process never acts on instructions in a folder, and never follows a
+link in it.
 """
 
 import importlib
@@ -20,7 +21,13 @@ from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
 from splinecli.system import files
-from splinecli.system.files import UNFINISHED, check_writable, create_hidden, refusals_as_output_errors, sync
+from splinecli.system.files import (
+    UNFINISHED,
+    check_writable,
+    create_hidden,
+    refusals_as_output_errors,
+    sync,
+)
 
 LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
 
@@ -31,10 +38,11 @@ class BusyError(OutputError):
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Make a folder and lock it; `wait` for another process that has locked it, instead of raising BusyError.
+    """Make a folder and lock it; `wait` for another process that has locked it, instead of raising
+    BusyError.
 
-    Raises OutputError if another user left a lock file that this process may not open, or OSError if the folder
-    cannot be made or written.
+    Raises OutputError if another user left a lock file that this process may not open, or OSError
+    if the folder cannot be made or written.
     """
     with locked_file(folder / LOCK, wait=wait):
         yield
@@ -47,7 +55,8 @@ def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        # Windows does not remove an open file. On other systems, a process that locks a removed file detects this.
+        # Windows does not remove an open file. On other systems, a process that locks a removed
+        # file detects this.
         if os.name == "nt":
             file.close()
         with suppress(OSError):
@@ -67,7 +76,10 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
             if not path.exists():
                 raise
             problem = "this lock file belongs to another user, who may be writing into the folder"
-            hint = "If no splinecli process of that user runs, remove the file. Otherwise choose another -o"
+            hint = (
+                "If no splinecli process of that user runs, remove the file. Otherwise choose"
+                " another -o"
+            )
             raise OutputError(problem, path=path, hint=hint) from None
         try:
             got = _try_lock(file)
@@ -79,17 +91,24 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
                 return file
         file.close()
         if not got and not wait:
-            problem, hint = "another splinecli process is writing into this folder", "Wait for it to end"
+            problem, hint = (
+                "another splinecli process is writing into this folder",
+                "Wait for it to end",
+            )
             raise BusyError(problem, path=path.parent, hint=f"{hint}, or choose another -o")
         if not got:
             time.sleep(0.02)
 
 
 def _open_lock(path: Path) -> IO[str]:
-    """Open a lock file, which is made as needed. Raises OutputError if it is not a file, but for example a pipe."""
+    """Open a lock file, which is made as needed. Raises OutputError if it is not a file, but for
+    example a pipe.
+    """
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
-    refused = OutputError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+    refused = OutputError(
+        "is not a file, so it cannot lock the folder", path=path, hint="Remove it"
+    )
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
     except (FileNotFoundError, PermissionError):
@@ -105,7 +124,9 @@ def _open_lock(path: Path) -> IO[str]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock an open file, unless another process has locked it. Raises OSError if locks are not supported."""
+    """Lock an open file, unless another process has locked it. Raises OSError if locks are not
+    supported.
+    """
     try:
         import fcntl
     except ImportError:
@@ -127,12 +148,16 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 
 
 @contextmanager
-def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False) -> Iterator[None]:
-    """Make a folder, lock it, and remove the unfinished files that killed processes left directly in it.
+def held_folder(
+    folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False
+) -> Iterator[None]:
+    """Make a folder, lock it, and remove the unfinished files that killed processes left directly
+    in it.
 
-    A folder that was made here and is empty at the end is removed, as are its parents. `warn` receives a sentence about
-    the files of a killed process. Raises BusyError if another process has locked the folder, unless it waits for that,
-    or OutputError if the folder cannot be made or written.
+    A folder that was made here and is empty at the end is removed, as are its parents. `warn`
+    receives a sentence about the files of a killed process. Raises BusyError if another process has
+    locked the folder, unless it waits for that, or OutputError if the folder cannot be made or
+    written.
     """
     check_writable(folder)
     with ExitStack() as stack:
@@ -181,11 +206,17 @@ class NewFiles:
                 if isinstance(content, np.ndarray):
                     np.save(file, content, allow_pickle=False)
                 else:
-                    file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
+                    file.write(
+                        content
+                        if isinstance(content, bytes)
+                        else content.encode(errors="backslashreplace")
+                    )
             sync(self.hidden[name])
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
-        """Remove the earlier files, and rename the new ones to their places, the report last. Raises OSError."""
+        """Remove the earlier files, and rename the new ones to their places, the report last.
+        Raises OSError.
+        """
         if report is not None:
             _remove(self._folder / report, self._folder)
             sync(self._folder)
@@ -206,11 +237,13 @@ class NewFiles:
 def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) -> Iterator[NewFiles]:
     """Yield a collector of new files. After the block, they replace the earlier ones.
 
-    The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
-    that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
+    The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as
+    they are. A process that ends during the replacement leaves a folder without a report. Raises
+    OutputError if a file cannot be written.
 
-    `report` names the file that describes the others: removed first, written last. It is None if the caller ensures
-    that no report names a file that changes. `stale` names earlier files that are removed if no new file replaces them.
+    `report` names the file that describes the others: removed first, written last. It is None if
+    the caller ensures that no report names a file that changes. `stale` names earlier files that
+    are removed if no new file replaces them.
     """
     new = NewFiles(folder)
     try:
@@ -225,7 +258,9 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 def refuse_link(folder: Path) -> None:
     """Raise OutputError if a folder is really a link, which may lead anywhere."""
     if folder.is_symlink():
-        raise OutputError("found a link, expected a folder", path=folder, hint="Remove it, or choose another -o")
+        raise OutputError(
+            "found a link, expected a folder", path=folder, hint="Remove it, or choose another -o"
+        )
 
 
 def is_plain(path: Path) -> bool:
@@ -245,7 +280,9 @@ def _check_place(path: Path, folder: Path) -> None:
 
 
 def _remove(path: Path, folder: Path) -> None:
-    """Remove a file or a link. A folder of that name stays. Raises OutputError as _check_place does, or OSError."""
+    """Remove a file or a link. A folder of that name stays. Raises OutputError as _check_place
+    does, or OSError.
+    """
     if path.parent != folder:
         refuse_link(path.parent)
     if path.is_symlink() or not path.is_dir():

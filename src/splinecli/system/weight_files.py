@@ -1,4 +1,6 @@
-"""Weight files: safetensors with a format, metadata and a checksum of the tensors. Nothing is unpickled."""
+"""Weight files: safetensors with a format, metadata and a checksum of the tensors. Nothing is
+unpickled.
+"""
 
 import hashlib
 import json
@@ -14,7 +16,8 @@ from torch import Tensor, nn
 from splinecli.errors import ModelError
 from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name, write_bytes
 
-LONGEST = 500_000_000  # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
+# largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
+LONGEST = 500_000_000
 _LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 SHIPPED = resources.files("splinecli") / "assets"
@@ -41,18 +44,27 @@ def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
     header["__metadata__"] = dict(sorted(metadata.items()))
     ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     ordered += b" " * (-len(ordered) % _LENGTH_BYTES)  # tensors start at a multiple of 8 bytes
-    return len(ordered).to_bytes(_LENGTH_BYTES, "little") + ordered + content[_LENGTH_BYTES + length :]
+    return (
+        len(ordered).to_bytes(_LENGTH_BYTES, "little") + ordered + content[_LENGTH_BYTES + length :]
+    )
 
 
 def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
-    """Write the parameters of a module as float16, with metadata and their checksum. Raises OutputError."""
+    """Write the parameters of a module as float16, with metadata and their checksum. Raises
+    OutputError.
+    """
     half = {name: tensor.detach().cpu().half() for name, tensor in module.state_dict().items()}
-    tensors = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()}
+    tensors = {
+        name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()
+    }
     write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
 
 
-def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its format and checksum.
+def read_tensors(
+    path: Path, expected_format: str, hint: str
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its format
+    and checksum.
 
     Raises ModelError, with the hint, if the file is missing, damaged or in another format.
     """
@@ -65,7 +77,9 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
             raise ModelError("no such file", path=path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
-            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > 1 << 20:  # a tensor takes about 100
+            if (
+                length := int.from_bytes(start.read(_LENGTH_BYTES), "little")
+            ) > 1 << 20:  # a tensor takes about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}
@@ -75,9 +89,13 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
                     raise ModelError(problem, path=path, hint=hint)
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
-        raise ModelError(f"not a safetensors file, or cut short ({error})", path=path, hint=hint) from error
+        raise ModelError(
+            f"not a safetensors file, or cut short ({error})", path=path, hint=hint
+        ) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
-        raise ModelError("damaged: the tensors do not match the checksum in the file", path=path, hint=hint)
+        raise ModelError(
+            "damaged: the tensors do not match the checksum in the file", path=path, hint=hint
+        )
     return tensors, metadata
 
 
@@ -88,8 +106,11 @@ def check_length(path: Path, hint: str) -> None:
         raise ModelError(found, path=path, hint=hint)
 
 
-def read_json_entry(metadata: dict[str, str], key: str, path: Path, kind: Any = dict[str, Any]) -> Any:
-    """Return the JSON object under a key of a file's metadata, or the record of this kind. Raises ModelError.
+def read_json_entry(
+    metadata: dict[str, str], key: str, path: Path, kind: Any = dict[str, Any]
+) -> Any:
+    """Return the JSON object under a key of a file's metadata, or the record of this kind. Raises
+    ModelError.
 
     The checksum does not cover it.
     """
@@ -102,12 +123,16 @@ def read_json_entry(metadata: dict[str, str], key: str, path: Path, kind: Any = 
 
 
 def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Load the tensors into the network. Raises ModelError for a missing, unknown or misshapen tensor."""
+    """Load the tensors into the network. Raises ModelError for a missing, unknown or misshapen
+    tensor.
+    """
     try:
         network.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise ModelError(f"the tensors do not fit the configuration ({reason})", path=path) from error
+        raise ModelError(
+            f"the tensors do not fit the configuration ({reason})", path=path
+        ) from error
 
 
 def load_shipped(module: Module, entry: dict[str, str], expected_format: str) -> Module:

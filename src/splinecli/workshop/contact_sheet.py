@@ -1,4 +1,6 @@
-"""The contact sheet of a pixel set: its scenes, each with its normals and two images of each material."""
+"""The contact sheet of a pixel set: its scenes, each with its normals and two images of each
+material.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ MOST_SCENES = 120
 
 
 def contact_sheet(pixel_set: PixelSet) -> Picture:
-    """Return an RGB picture (H, W, 3) with a strip for each scene, or for an even choice of at most MOST_SCENES."""
+    """Return an RGB picture (H, W, 3) with a strip for each scene, or for an even choice of at most
+    MOST_SCENES.
+    """
     scenes: dict[str, list[Entry]] = {}
     for entry in pixel_set.entries:
         scenes.setdefault(entry.scene, []).append(entry)
@@ -38,7 +42,12 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
 
 def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
     first = pixel_set.load(entries[0])
-    tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8), tile)]
+    tiles = [
+        _fit(
+            encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8),
+            tile,
+        )
+    ]
     for pixels in map(pixel_set.load, entries):
         for light in ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63)):
             # The image under the closest light, scaled so that its 98th percentile is white.

@@ -1,11 +1,12 @@
 """Import of the original weights of SPLINE-Net (Zheng et al., ICCV 2019).
 
-The authors' PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). Our network
-of size "paper" has the same layers but different conventions. The import converts the weights once:
+The authors' PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt
+(NE-Net). Our network of size "paper" has the same layers but different conventions. The import
+converts the weights once:
 
-- Rows: y increases with the row in their maps and decreases in ours. Every kernel is flipped along its height, and so
-  are the map rows read by the first linear layer. All paddings are symmetric and all sizes even, so the result is the
-  flipped result of their network.
+- Rows: y increases with the row in their maps and decreases in ours. Every kernel is flipped along
+  its height, and so are the map rows read by the first linear layer. All paddings are symmetric and
+  all sizes even, so the result is the flipped result of their network.
 - Channels: theirs are (dense, sparse), ours are (sparse, dense).
 - Cells and disc: the setting grid = "cnn-ps".
 
@@ -41,16 +42,19 @@ _NE_NET_MODULES = {
 }
 
 
-# Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB and 2,000.
+# Limits: records in an archive, bytes and instructions in a pickle. The authors' have dozens, 10 kB
+# and 2,000.
 _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
-    """Return the authors' network, float32, in evaluation mode, from two files of state dictionaries.
+    """Return the authors' network, float32, in evaluation mode, from two files of state
+    dictionaries.
 
-    Their generator (G) is LI-Net, their discriminator (D) is NE-Net. Dropout is disabled in evaluation mode, but the
-    authors' test code leaves it enabled. Raises ModelError if a file cannot be read or is not a
-    state dictionary, or a tensor is missing, unknown, of another shape or not finite.
+    Their generator (G) is LI-Net, their discriminator (D) is NE-Net. Dropout is disabled in
+    evaluation mode, but the authors' test code leaves it enabled. Raises ModelError if a file
+    cannot be read or is not a state dictionary, or a tensor is missing, unknown, of another shape
+    or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
@@ -69,13 +73,17 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
 
 def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Flip every kernel (every 4-dimensional tensor) along its height."""
-    return {prefix + name: tensor.flip(2) if tensor.ndim == 4 else tensor for name, tensor in tensors.items()}
+    return {
+        prefix + name: tensor.flip(2) if tensor.ndim == 4 else tensor
+        for name, tensor in tensors.items()
+    }
 
 
 def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
     names = {name: name.replace("layers", "main") for name in li_net.state_dict()}
-    # Running statistics that their instance norms collect in training. The authors' code normalises by the statistics
-    # of each map, even at test time (it never leaves training mode), so these values are not used.
+    # Running statistics that their instance norms collect in training. The authors' code normalises
+    # by the statistics of each map, even at test time (it never leaves training mode), so these
+    # values are not used.
     tracked: dict[str, torch.Size] = {}
     for name, tensor in li_net.state_dict().items():
         norm, _, kind = names[name].rpartition(".")
@@ -85,8 +93,12 @@ def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
     return _rename(path, li_net, names, tracked)
 
 
-def _rename(path: Path, network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]) -> dict[str, Tensor]:
-    """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists unused shapes."""
+def _rename(
+    path: Path, network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
+) -> dict[str, Tensor]:
+    """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists
+    unused shapes.
+    """
     state = _read_state(path)
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
@@ -96,22 +108,32 @@ def _rename(path: Path, network: nn.Module, names: dict[str, str], dropped: dict
     shapes |= dropped
     unknown = [name for name in state if name not in shapes]
     if unknown:
-        raise ModelError(f"has {_listed(unknown)}, which the network does not have", path=path, hint=hint)
+        raise ModelError(
+            f"has {_listed(unknown)}, which the network does not have", path=path, hint=hint
+        )
     for name, tensor in state.items():
         if tensor.shape != shapes[name]:
             found, expected = tuple(tensor.shape), tuple(shapes[name])
-            raise ModelError(f"tensor {name!r} has the shape {found}, expected {expected}", path=path)
+            raise ModelError(
+                f"tensor {name!r} has the shape {found}, expected {expected}", path=path
+            )
     for name in names.values():
         if not state[name].is_floating_point():
-            raise ModelError(f"tensor {name!r} is of {state[name].dtype}, expected real numbers", path=path)
+            raise ModelError(
+                f"tensor {name!r} is of {state[name].dtype}, expected real numbers", path=path
+            )
         # Weight files are float16.
         if not torch.isfinite(state[name].half()).all():
-            raise ModelError(f"tensor {name!r} has values that are not finite, or too large", path=path)
+            raise ModelError(
+                f"tensor {name!r} has values that are not finite, or too large", path=path
+            )
     return {ours: state[theirs].float() for ours, theirs in names.items()}
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """Read the tensors in a file written by torch.save. Only tensors and plain containers are unpickled."""
+    """Read the tensors in a file written by torch.save. Only tensors and plain containers are
+    unpickled.
+    """
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
         check_file(path, "a checkpoint")
@@ -125,13 +147,19 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     except ModelError:
         raise
     except OSError as error:
-        raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
+        raise ModelError(
+            f"cannot be read ({error.strerror or error})", path=path, hint=hint
+        ) from error
     except Exception as error:  # damaged pickles raise many types of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
         isinstance(name, str)
         and isinstance(tensor, Tensor)
-        and (tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized)
+        and (
+            tensor.layout == torch.strided
+            and tensor.device.type == "cpu"
+            and not tensor.is_quantized
+        )
         for name, tensor in state.items()
     ):
         raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
@@ -141,22 +169,31 @@ def _read_state(path: Path) -> dict[str, Tensor]:
 def _check_content(path: Path) -> None:
     """Raise ValueError for a checkpoint that would use far more memory than its file size.
 
-    It may be an archive with uncompressed records, as written by torch.save since 1.6, or pickles and numbers.
+    It may be an archive with uncompressed records, as written by torch.save since 1.6, or pickles
+    and numbers.
     """
     with path.open("rb") as file:
         if file.read(4) == b"PK\3\4":
-            # Count the records before reading the directory, which has one such mark for each record.
-            if sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b"")) > _MOST_RECORDS:
+            # Count the records before reading the directory, which has one such mark for each
+            # record.
+            if (
+                sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b""))
+                > _MOST_RECORDS
+            ):
                 raise ValueError("too many records")
             records = zipfile.ZipFile(file).infolist()
             expanded = sum(record.file_size for record in records)
-            pickled = sum(record.file_size for record in records if record.filename.endswith(".pkl"))
+            pickled = sum(
+                record.file_size for record in records if record.filename.endswith(".pkl")
+            )
             if expanded > path.stat().st_size or pickled > _LONGEST_PICKLE:
                 raise ValueError("records that are compressed, or too many tensors")
             return
         file.seek(0)
         steps = 0
-        for _ in range(5):  # a mark, the version, the system, the tensors, and the names of their numbers
+        for _ in range(
+            5
+        ):  # a mark, the version, the system, the tensors, and the names of their numbers
             for _ in pickletools.genops(file):
                 steps += 1
                 if steps > _MOST_STEPS:

@@ -10,14 +10,7 @@ from msgspec import Meta
 from splinecli.errors import UsageError
 from splinecli.pipeline import infer_options as shared
 from splinecli.pipeline.infer_options import OUTPUT, Display, Workers
-from splinecli.records.base import (
-    Count,
-    Natural,
-    NotNegative,
-    Option,
-    Record,
-    Seed,
-)
+from splinecli.records.base import Count, Natural, NotNegative, Option, Record, Seed
 from splinecli.workshop import training
 
 
@@ -26,7 +19,12 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
 
     sources: Annotated[
         tuple[Path, ...],
-        Option("Arguments", "SOURCE", "Captures with ground truth, folders of them, CyclesPS trees.", repeated=True),
+        Option(
+            "Arguments",
+            "SOURCE",
+            "Captures with ground truth, folders of them, CyclesPS trees.",
+            repeated=True,
+        ),
     ] = ()
     as_stored: shared.AsStored = False
     white_level: shared.WhiteLevel = None
@@ -44,7 +42,11 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     ] = ()
     views: Annotated[
         Natural,
-        Option("Scenes", "N", "Render each mesh N times, from random views. 0 renders it once, along its +z axis."),
+        Option(
+            "Scenes",
+            "N",
+            "Render each mesh N times, from random views. 0 renders it once, along its +z axis.",
+        ),
     ] = 0
     reliefs: Annotated[
         tuple[Path, ...],
@@ -72,16 +74,20 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
 def parse_light_counts(text: str) -> dict[str, int]:
     """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
 
-    The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
-    not a valid range, or a pixel would have fewer than 3 lights.
+    The usual number of lights is 10, as published, or the nearest number in the range. Raises
+    UsageError if the text is not a valid range, or a pixel would have fewer than 3 lights.
     """
     low, dash, high = text.partition("-")
     try:
         fewest, most = int(low), int(high if dash else low)
     except ValueError:
-        raise UsageError(f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96") from None
+        raise UsageError(
+            f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96"
+        ) from None
     if not 3 <= fewest <= most:
-        raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
+        raise UsageError(
+            f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first"
+        )
     return {"min_lights": fewest, "max_lights": most, "usual_lights": min(max(10, fewest), most)}
 
 
@@ -89,7 +95,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     """The options of `train`."""
 
     sets: Annotated[
-        tuple[Path, ...], Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.", repeated=True)
+        tuple[Path, ...],
+        Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.", repeated=True),
     ] = ()
     preset: Annotated[
         str | None,
@@ -101,12 +108,17 @@ class TrainOptions(Record, frozen=True, kw_only=True):
             complete=training.PRESET_NAMES,
         ),
     ] = None
-    config: Annotated[Path | None, Option("Settings", "FILE", "Settings from a TOML file or a run's config.json.")] = (
-        None
-    )
+    config: Annotated[
+        Path | None, Option("Settings", "FILE", "Settings from a TOML file or a run's config.json.")
+    ] = None
     param: Annotated[
         tuple[str, ...],
-        Option("Settings", "NAME=VALUE", "One setting, such as pixels.wall_share=0.3. May be repeated.", repeated=True),
+        Option(
+            "Settings",
+            "NAME=VALUE",
+            "One setting, such as pixels.wall_share=0.3. May be repeated.",
+            repeated=True,
+        ),
     ] = ()
     start_from: Annotated[
         str | None,
@@ -121,12 +133,21 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     seed: Annotated[Seed | None, Option("Settings", "S", "Seed of the run.", default="0")] = None
     generator_weight: Annotated[
         NotNegative | None,
-        Option("Pixels", "W", "Weight of generated pixels; each SET has weight 1.", default="0; 1 without SET"),
+        Option(
+            "Pixels",
+            "W",
+            "Weight of generated pixels; each SET has weight 1.",
+            default="0; 1 without SET",
+        ),
     ] = None
     n_lights: Annotated[
         dict[str, int] | None,
         Option(
-            "Pixels", "K|MIN-MAX", "Number of lights of each pixel.", default="the preset's", parse=parse_light_counts
+            "Pixels",
+            "K|MIN-MAX",
+            "Number of lights of each pixel.",
+            default="the preset's",
+            parse=parse_light_counts,
         ),
     ] = None
     steps: Annotated[
@@ -141,7 +162,12 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     ] = None
     minutes: Annotated[
         Annotated[float, Meta(ge=0.01)] | None,
-        Option("Length", "M", "Train for M minutes instead of a number of steps.", default="train for --steps"),
+        Option(
+            "Length",
+            "M",
+            "Train for M minutes instead of a number of steps.",
+            default="train for --steps",
+        ),
     ] = None
     resume: Annotated[bool, Option("Length", "", "Continue from the run's checkpoint.")] = False
     output: Annotated[
@@ -149,7 +175,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
         Option(
             "Output",
             "RUN",
-            f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS} seconds.",
+            f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS}"
+            " seconds.",
             names=OUTPUT,
         ),
     ]
@@ -168,8 +195,15 @@ class TrainOptions(Record, frozen=True, kw_only=True):
 class ImportOptions(Record, frozen=True, kw_only=True):
     """The options of `import-weights`."""
 
-    li_net: Annotated[Path, Option("Arguments", "G.ckpt", "The authors' LI-Net, which they call the generator.")]
-    ne_net: Annotated[Path, Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator.")]
-    output: Annotated[Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)]
+    li_net: Annotated[
+        Path, Option("Arguments", "G.ckpt", "The authors' LI-Net, which they call the generator.")
+    ]
+    ne_net: Annotated[
+        Path,
+        Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator."),
+    ]
+    output: Annotated[
+        Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)
+    ]
     overwrite: Annotated[bool, Option("Output", "", "Replace an existing file.")] = False
     quiet: shared.Quiet = False

@@ -26,16 +26,23 @@ from splinecli.workshop.synthesis.scenes import SceneConfig
 def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
-    A capture that cannot be used is left out, and the observer receives the error; `skipped` in the summary holds the
-    reason and an exit code. Any other error stops the work, and calling the function again resumes it: InputError for a
-    mesh, OutputError, also for a scene with other settings in the set, or UsageError if there is nothing to prepare.
+    A capture that cannot be used is left out, and the observer receives the error; `skipped` in the
+    summary holds the reason and an exit code. Any other error stops the work, and calling the
+    function again resumes it: InputError for a mesh, OutputError, also for a scene with other
+    settings in the set, or UsageError if there is nothing to prepare.
     """
     output, config = options.output, SceneConfig()
-    config = replace(config, size=options.size or config.size, lights=options.n_lights or config.lights)
-    plan = ScenePlan(config, options.seed, options.scenes, options.meshes, options.views, options.reliefs)
+    config = replace(
+        config, size=options.size or config.size, lights=options.n_lights or config.lights
+    )
+    plan = ScenePlan(
+        config, options.seed, options.scenes, options.meshes, options.views, options.reliefs
+    )
     captures = [folder for source in options.sources for folder in find_captures(source)]
     if not captures and not plan.names:
-        raise UsageError("nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE")
+        raise UsageError(
+            "nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE"
+        )
     check_writable(output)
     plan.check_inputs()
     cluster = ClusterOptions(workers=options.processes.workers).on_cores(len(plan.names))
@@ -45,20 +52,30 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         named = entries.name_captures(captures, writer)
         with observer.progress("preparing", len(named) + len(plan.names)) as advance:
             skipped: list[dict[str, Any]] = []
-            how: dict[str, Any] = {"as_stored": options.as_stored, "white_level": options.white_level}
+            how: dict[str, Any] = {
+                "as_stored": options.as_stored,
+                "white_level": options.white_level,
+            }
             for name, folder in named.items():
                 try:
                     entries.add_capture(writer, name, folder, update=options.update, **how)
                     observer.say(writer.describe(name))
                 except (InputError, CaptureChangedError, OSError) as refused:
-                    error = as_splinecli_error(refused, folder) if isinstance(refused, OSError) else refused
+                    error = (
+                        as_splinecli_error(refused, folder)
+                        if isinstance(refused, OSError)
+                        else refused
+                    )
                     observer.error(str(error))
-                    skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
+                    skipped.append(
+                        {"source": str(folder), "reason": str(error), "exit_code": error.exit_code}
+                    )
                 advance(1)
             _render_scenes(writer, plan, cluster, observer, advance)
         pixel_set = PixelSet(output, ())
         if len(writer):
-            # Written before the set is marked as finished, so that a finished set always has its own overview.
+            # Written before the set is marked as finished, so that a finished set always has its
+            # own overview.
             write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
             pixel_set = writer.finish()
     return {
@@ -74,12 +91,17 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
 
 
 def _render_scenes(
-    writer: PixelSetWriter, plan: ScenePlan, cluster: ClusterOptions | None, observer: Observer, advance: Advance
+    writer: PixelSetWriter,
+    plan: ScenePlan,
+    cluster: ClusterOptions | None,
+    observer: Observer,
+    advance: Advance,
 ) -> None:
-    """Render the scenes missing from the set, in this process or on workers, and add them in the order of the plan.
+    """Render the scenes missing from the set, in this process or on workers, and add them in the
+    order of the plan.
 
-    Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any error from a worker
-    or the set.
+    Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any
+    error from a worker or the set.
     """
     reached = 0.0
 
@@ -96,7 +118,9 @@ def _render_scenes(
         reached = 0.0
 
     positions = range(len(plan.names))
-    missing = [p for p in positions if not all(name in writer for name in plan.entry_names(p).values())]
+    missing = [
+        p for p in positions if not all(name in writer for name in plan.entry_names(p).values())
+    ]
     if cluster is None:
         for position in positions:
             if position in missing:
@@ -110,7 +134,10 @@ def _render_scenes(
     position = 0
     try:
         with distributor(render, writer.folder, cluster, observer) as workers:
-            ended = ((item.args[0], shape) for item, shape in workers.run(Item((n,), plan.names[n]) for n in missing))
+            ended = (
+                (item.args[0], shape)
+                for item, shape in workers.run(Item((n,), plan.names[n]) for n in missing)
+            )
             for number, result in chain(in_set, ended):
                 rendered[number] = result
                 while position in rendered:

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from scenes import directions_at, shade, sphere
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.film import FEWEST_FRAMES, MOST_FRAMES, choose_frames, is_film, read_frames
+from splinecli.capture.formats.film import (
+    FEWEST_FRAMES,
+    MOST_FRAMES,
+    choose_frames,
+    is_film,
+    read_frames,
+)
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
 from splinecli.pictures.maps import encode_png
@@ -27,7 +33,9 @@ def encode_bt709(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def sphere_film(lights: NDArray[np.float64], texture: float = 0.3) -> NDArray[np.uint8]:
-    """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3), with noise."""
+    """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3),
+    with noise.
+    """
     normals, inside = sphere(SIZE)
     rng = np.random.default_rng(1)
     albedo = inside * (0.9 - texture * rng.uniform(size=inside.shape))
@@ -82,7 +90,9 @@ def test_the_curve_is_undone() -> None:
 
 @pytest.mark.parametrize(("number", "curve"), [(1, BT709), (8, 1.0), (13, None)])
 def test_code_points_go_before_other_curves(tmp_path: Path, number: int, curve: object) -> None:
-    """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic range."""
+    """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic
+    range.
+    """
     file = encode_png(np.zeros((4, 4), np.uint8), film=True)
     place = file.index(b"cICP") + 5
     for value, expected in ((number, (curve, False)), (16, (1.0, True))):

@@ -1,6 +1,8 @@
-"""Photographs and masks: values exactly as written, and damaged files refused without a word on stderr.
+"""Photographs and masks: values exactly as written, and damaged files refused without a word on
+stderr.
 
-BMP, TGA and EXIF tags (exposures and orientations, one of each for all images) are written by Pillow.
+BMP, TGA and EXIF tags (exposures and orientations, one of each for all images) are written by
+Pillow.
 """
 
 import struct
@@ -17,7 +19,13 @@ from PIL.TiffImagePlugin import IFDRational
 from capture.conftest import WriteImage
 from scenes import ring_lights, with_chunk, write_capture
 from splinecli.capture import open_capture, read_capture, read_image, read_mask
-from splinecli.capture.formats.facts import UPRIGHT, Exposure, common_orientation, find_exposure, read_header
+from splinecli.capture.formats.facts import (
+    UPRIGHT,
+    Exposure,
+    common_orientation,
+    find_exposure,
+    read_header,
+)
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
 from splinecli.records import capture_warnings
@@ -28,7 +36,9 @@ RGB8 = (RGB16 >> 8).astype(np.uint8)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "A.TIFF"])
-@pytest.mark.parametrize("stored", [RGB16, RGB8, RGB16[..., 0], RGB8[..., 0]], ids=["rgb16", "rgb8", "gray16", "gray8"])
+@pytest.mark.parametrize(
+    "stored", [RGB16, RGB8, RGB16[..., 0], RGB8[..., 0]], ids=["rgb16", "rgb8", "gray16", "gray8"]
+)
 def test_integers_are_scaled_by_their_full_range(write_image, name, stored):
     image = read_image(write_image(name, stored))
     assert image.dtype == np.float32
@@ -47,7 +57,12 @@ def test_floating_point_tiff_is_kept(tmp_path: Path, dtype: type, channels: int)
 
 @pytest.mark.parametrize(
     "options",
-    [{"compression": "zlib"}, {"compression": "zlib", "predictor": True}, {"tile": (16, 16)}, {"bigtiff": True}],
+    [
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": True},
+        {"tile": (16, 16)},
+        {"bigtiff": True},
+    ],
     ids=["deflate", "predictor", "tiles", "bigtiff"],
 )
 def test_kinds_of_tiff(tmp_path: Path, options: dict[str, object]) -> None:
@@ -56,14 +71,18 @@ def test_kinds_of_tiff(tmp_path: Path, options: dict[str, object]) -> None:
 
 
 def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "a.tif", np.moveaxis(RGB16, 2, 0), photometric="rgb", planarconfig="separate")
+    tifffile.imwrite(
+        tmp_path / "a.tif", np.moveaxis(RGB16, 2, 0), photometric="rgb", planarconfig="separate"
+    )
     bgra = np.dstack([RGB16[..., ::-1], RNG.integers(0, 65536, (7, 9)).astype(np.uint16)])
     cv2.imwrite(str(tmp_path / "alpha.png"), bgra)
     cv2.imwrite(str(tmp_path / "alpha.tif"), bgra)
     for name in ("a.tif", "alpha.png", "alpha.tif"):
         np.testing.assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
     tifffile.imwrite(tmp_path / "w.tif", 255 - RGB8[..., 0], photometric="miniswhite")
-    np.testing.assert_array_equal(read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255))
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255)
+    )
 
 
 def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
@@ -75,7 +94,12 @@ def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
     # An EXIF segment that asks for a turn by 90 degrees: one entry, tag 0x112, orientation 6.
     exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6) + b"\0" * 4
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
-    assert cv2.imread(str(path)).shape == (32, 16, 3)  # the segment works: by default OpenCV turns the image
+    # the segment works: by default OpenCV turns the image
+    assert cv2.imread(str(path)).shape == (
+        32,
+        16,
+        3,
+    )
     image = read_image(path)
     assert image.shape == (16, 32, 3)
     apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet
@@ -98,7 +122,10 @@ def test_truncated_and_damaged_images(tmp_path, write_image, capfd, name):
         contents.append(data[: len(data) // 2] + bytes(30) + data[len(data) // 2 + 30 :])
     for content in contents:
         path.write_bytes(content)
-        message = r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\. Copy or export it again\."
+        message = (
+            r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\."
+            r" Copy or export it again\."
+        )
         with pytest.raises(InputError, match=message) as caught:
             read_image(path)
         assert caught.value.path == path
@@ -113,19 +140,23 @@ def test_the_c_library_is_silent_and_gamma_is_not_applied(write_image, capfd):
     np.testing.assert_array_equal(read_image(path), RGB16 / np.float32(65535))
     assert capfd.readouterr() == ("", "")
     cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert "iCCP" in capfd.readouterr().err  # libpng does complain of this file when nobody holds its mouth
+    # libpng does complain of this file when nobody holds its mouth
+    assert "iCCP" in capfd.readouterr().err
 
 
 NOT_FINITE = "a value that is not finite"
 
 
 @pytest.mark.parametrize(
-    ("value", "found"), [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-0.5, "the negative value -0.5")]
+    ("value", "found"),
+    [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-0.5, "the negative value -0.5")],
 )
 def test_values_no_photograph_has(tmp_path: Path, value: float, found: str) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.array([[1, value]], np.float32))
-    with pytest.raises(InputError, match=rf"a\.tif: found {found}.*expected a photograph\.") as caught:
+    with pytest.raises(
+        InputError, match=rf"a\.tif: found {found}.*expected a photograph\."
+    ) as caught:
         read_image(path)
     assert ("Set values below zero" in str(caught.value)) == (value == -0.5)
 
@@ -135,7 +166,9 @@ def test_files_that_are_no_such_image(tmp_path: Path) -> None:
     (tmp_path / "header.tif").write_bytes(b"II*\0\x08\0\0\0")
     tifffile.imwrite(tmp_path / "int.tif", RGB16.astype(np.int32), photometric="rgb")
     palette = np.zeros((3, 256), np.uint16)
-    tifffile.imwrite(tmp_path / "palette.tif", RGB8[..., 0], photometric="palette", colormap=palette)
+    tifffile.imwrite(
+        tmp_path / "palette.tif", RGB8[..., 0], photometric="palette", colormap=palette
+    )
     for name, message in (
         (".", "found a folder, expected an image"),
         ("empty.tif", "the file is empty"),
@@ -166,27 +199,37 @@ CUT_OUT = np.array([[0, 0, 255], [0, 200, 255]], np.uint8)
 @pytest.mark.parametrize("colour", [0, 90, 255])
 def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path: Path, name: str, colour: int) -> None:
     for alpha, scale in ((CUT_OUT, 1), (CUT_OUT.astype(np.uint16) * 257, 257)):
-        cv2.imwrite(str(tmp_path / name), np.dstack([np.full_like(alpha, colour * scale)] * 3 + [alpha]))
+        cv2.imwrite(
+            str(tmp_path / name), np.dstack([np.full_like(alpha, colour * scale)] * 3 + [alpha])
+        )
         np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
     # Alpha that cuts nothing out leaves the mask to the colours.
     for nothing in (np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]):
-        cv2.imwrite(str(tmp_path / name), np.dstack([CUT_OUT] * 3 + [np.asarray(nothing, np.uint8)]))
+        cv2.imwrite(
+            str(tmp_path / name), np.dstack([CUT_OUT] * 3 + [np.asarray(nothing, np.uint8)])
+        )
         np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
 
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
 
 
-@pytest.mark.parametrize(("suffix", "options"), [(".bmp", {}), (".tga", {}), (".tga", {"compression": "tga_rle"})])
+@pytest.mark.parametrize(
+    ("suffix", "options"), [(".bmp", {}), (".tga", {}), (".tga", {"compression": "tga_rle"})]
+)
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("L", 1), ("P", 3)])
-def test_pixels(tmp_path: Path, suffix: str, options: dict[str, str], mode: str, channels: int) -> None:
+def test_pixels(
+    tmp_path: Path, suffix: str, options: dict[str, str], mode: str, channels: int
+) -> None:
     picture = Image.fromarray(RGB).convert(mode)
     picture.save(tmp_path / f"image{suffix}", **options)
     path = tmp_path / f"image{suffix}"
     expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
     np.testing.assert_array_equal(decode_image(path), expected)
     facts = read_header(path)
-    assert facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
+    assert (
+        facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
+    )
 
 
 @pytest.mark.parametrize("suffix", [".bmp", ".tga"])
@@ -210,7 +253,12 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
     (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
     assert str(found).startswith("owl.mask.bmp and 1 more: left out")
     # If all of them have such names, these say nothing.
-    assert read_capture(write_capture(tmp_path / "a", pictures, lights, names="mask_of_a_king_{}.png")).n_lights == 6
+    assert (
+        read_capture(
+            write_capture(tmp_path / "a", pictures, lights, names="mask_of_a_king_{}.png")
+        ).n_lights
+        == 6
+    )
 
 
 def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -> None:
@@ -219,7 +267,9 @@ def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -
     capture = read_capture(folder)
     assert (capture.n_lights, capture.mask.shape) == (6, (4, 5))
     (found,) = [w for w in capture.warnings if w.kind == capture_warnings.IMAGES_LEFT_OUT]
-    assert str(found).startswith("thumb.png: left out, because light_directions.txt has no light for it")
+    assert str(found).startswith(
+        "thumb.png: left out, because light_directions.txt has no light for it"
+    )
     Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "006.png")
     with pytest.raises(InputError, match="found 6 light directions, expected 8"):
         read_capture(folder)
@@ -228,7 +278,9 @@ def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -
 EXIF = 0x8769
 
 
-def write(path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100) -> Path:
+def write(
+    path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100
+) -> Path:
     image = Image.fromarray(np.full((6, 8, 3), 90, np.uint8))
     tags = Image.Exif()
     tags[0x010F] = "Maker"  # without any tag of its own Pillow leaves all out
@@ -248,7 +300,9 @@ def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
 
 def test_reading(tmp_path: Path) -> None:
     for suffix in ("jpg", "png"):
-        assert find_exposure(read_header(write(tmp_path / f"a.{suffix}"))) == Exposure(1 / 60, 8.0, 100)
+        assert find_exposure(read_header(write(tmp_path / f"a.{suffix}"))) == Exposure(
+            1 / 60, 8.0, 100
+        )
         assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
 
 
@@ -262,7 +316,10 @@ def test_mixed_exposures_are_divided_out(tmp_path: Path) -> None:
         assert source.warnings[0].code == "exif_exposure"
         assert "from 1/60 s, f/8, ISO 100 to 1/30 s, f/8, ISO 100." in str(source.warnings[0])
     write(folder / "1.jpg", None)
-    message = r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s, f/8, ISO 100 as in 0\.jpg"
+    message = (
+        r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s,"
+        r" f/8, ISO 100 as in 0\.jpg"
+    )
     with pytest.raises(InputError, match=message):
         open_capture(folder)
     # Intensities say how the images compare.
@@ -285,15 +342,29 @@ def turned(folder: Path, name: str, orientation: int | None) -> Path:
     return folder / name
 
 
-@pytest.mark.parametrize(("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)])
-def test_one_orientation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: int | None, expected: int) -> None:
+@pytest.mark.parametrize(
+    ("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)]
+)
+def test_one_orientation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: int | None, expected: int
+) -> None:
     """The pixels are not decoded, which takes seconds for 24 megapixels."""
-    images = [turned(tmp_path, "a.jpg", tag), turned(tmp_path, "b.tif", tag), turned(tmp_path, "c.png", tag)]
+    images = [
+        turned(tmp_path, "a.jpg", tag),
+        turned(tmp_path, "b.tif", tag),
+        turned(tmp_path, "c.png", tag),
+    ]
     monkeypatch.setattr(ImageFile.ImageFile, "load", None)
     assert common_orientation([read_header(image) for image in images]) == expected
 
 
 def test_different_orientations_are_refused(tmp_path: Path) -> None:
-    images = [turned(tmp_path, "a.jpg", None), turned(tmp_path, "b.jpg", 1), turned(tmp_path, "c.jpg", 8)]
-    with pytest.raises(InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"):
+    images = [
+        turned(tmp_path, "a.jpg", None),
+        turned(tmp_path, "b.jpg", 1),
+        turned(tmp_path, "c.jpg", 8),
+    ]
+    with pytest.raises(
+        InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"
+    ):
         common_orientation([read_header(image) for image in images])

@@ -24,7 +24,10 @@ MASK[0] = False
 @pytest.fixture
 def normals() -> NDArray[np.float64]:
     """(4, 5, 3) unit normals, zero at [1, 2] and outside the mask."""
-    field = unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1]) * MASK[..., None]
+    field = (
+        unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1])
+        * MASK[..., None]
+    )
     field[1, 2] = 0
     return np.asarray(field)
 
@@ -48,26 +51,36 @@ def write(path: Path, normals: NDArray[np.float64]) -> Path:
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
 @pytest.mark.parametrize("length", [1, 0.95, 40])
-def test_floating_point_sources(tmp_path: Path, normals: NDArray[np.float64], name: str, length: float) -> None:
+def test_floating_point_sources(
+    tmp_path: Path, normals: NDArray[np.float64], name: str, length: float
+) -> None:
     read = read_normals(write(tmp_path / name, normals * length), MASK)
     assert read.dtype == np.float32
     np.testing.assert_allclose(read, normals, atol=2e-7)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy", "a.mat"])
-@pytest.mark.parametrize(("bits", "error_deg"), [(16, 0.002), (8, 0.5)])  # half a step of each channel
+# half a step of each channel
+@pytest.mark.parametrize(("bits", "error_deg"), [(16, 0.002), (8, 0.5)])
 def test_pictures(write_image, tmp_path, normals, name, bits, error_deg):
     has_normal = normals.any(axis=2)
     picture = encode_picture(normals, has_normal, bits=bits)
-    path = write_image(name, picture) if name in ("a.png", "a.tif") else write(tmp_path / name, picture)
+    path = (
+        write_image(name, picture)
+        if name in ("a.png", "a.tif")
+        else write(tmp_path / name, picture)
+    )
     read = read_normals(path, MASK)
     assert not read[~has_normal].any()
     assert angle_between_deg(read[has_normal], normals[has_normal]).max() < error_deg
     np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
 
 
-def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(tmp_path, write_image, normals):
-    picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)  # zero vectors become 128, 128, 128
+def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(
+    tmp_path, write_image, normals
+):
+    # zero vectors become 128, 128, 128
+    picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)
     assert not read_normals(write_image("a.png", picture), np.ones(SHAPE, bool))[1, 2].any()
     stored = normals.copy()
     stored[0] = [0, 0, 1]
@@ -85,11 +98,15 @@ def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> N
     np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
     for arrays, names in (({"N": normals, "M": normals}, "N, M"), ({"mask": MASK}, "none")):
         scipy.io.savemat(path, arrays)
-        with pytest.raises(InputError, match=f"no Normal_gt, and of other H x W x 3 arrays {names}, expected one"):
+        with pytest.raises(
+            InputError, match=f"no Normal_gt, and of other H x W x 3 arrays {names}, expected one"
+        ):
             read_normals(path, MASK)
 
 
-def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_text_with_commas_and_with_a_wrong_word(
+    tmp_path: Path, normals: NDArray[np.float64]
+) -> None:
     path = tmp_path / "a.txt"
     rows = ["{:.9f}, {:.9f}, {:.9f}".format(*row) for row in normals.reshape(-1, 3)]
     path.write_text("\n".join(rows))
@@ -99,8 +116,12 @@ def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray
         read_normals(path, MASK)
 
 
-def test_damaged_and_unknown_files_and_other_sizes(tmp_path: Path, normals: NDArray[np.float64]) -> None:
-    sizes = dict.fromkeys(("a.mat", "a.npy", "a.tif"), "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in")
+def test_damaged_and_unknown_files_and_other_sizes(
+    tmp_path: Path, normals: NDArray[np.float64]
+) -> None:
+    sizes = dict.fromkeys(
+        ("a.mat", "a.npy", "a.tif"), "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in"
+    )
     sizes["a.txt"] = "found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
     for name, message in sizes.items():
         with pytest.raises(InputError, match=message):
@@ -116,11 +137,15 @@ def test_damaged_and_unknown_files_and_other_sizes(tmp_path: Path, normals: NDAr
         with pytest.raises(InputError, match=message):
             read_normals(path, MASK)
     (tmp_path / "a.exr").touch()
-    with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png, \.tif or \.bmp'):
+    with pytest.raises(
+        InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png, \.tif or \.bmp'
+    ):
         read_normals(tmp_path / "a.exr", MASK)
 
 
-def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_rows_in_the_wrong_order_are_turned_over(
+    tmp_path: Path, normals: NDArray[np.float64]
+) -> None:
     # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
     path = write(tmp_path / "normal.txt", normals[::-1])
     read, upside_down = read_ground_truth(path, MASK)
@@ -129,17 +154,25 @@ def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArra
     assert not read_ground_truth(write(path, normals), MASK)[1]
     # A mask that is its own mirror image tells nothing.
     full = np.ones(SHAPE, bool)
-    np.testing.assert_allclose(read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7)
+    np.testing.assert_allclose(
+        read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7
+    )
 
 
-def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(tmp_path, write_image, normals):
+def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(
+    tmp_path, write_image, normals
+):
     for bits in (8, 16):
         picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
-        with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are not normals"):
+        with pytest.raises(
+            InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are not normals"
+        ):
             read_normal_map(write_image("photograph.png", picture))
     damaged = normals.astype(np.float32)
     damaged[3, 4] = 1e30
-    np.testing.assert_allclose(np.linalg.norm(read_normal_map(write(tmp_path / "a.npy", damaged))[3, 4]), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(read_normal_map(write(tmp_path / "a.npy", damaged))[3, 4]), 1, atol=1e-6
+    )
 
 
 def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
@@ -155,9 +188,17 @@ def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
-def test_matlab_s_numbers_are_those_that_scipy_reads(tmp_path: Path, dtype: str, compressed: bool) -> None:
+def test_matlab_s_numbers_are_those_that_scipy_reads(
+    tmp_path: Path, dtype: str, compressed: bool
+) -> None:
     values = np.random.default_rng(0).integers(0, 100, (*SHAPE, 3)).astype(dtype)
-    arrays = {"a": np.eye(2), "words": "text", "parts": {"b": 1}, "z": np.ones(3, complex), "N": values}
+    arrays = {
+        "a": np.eye(2),
+        "words": "text",
+        "parts": {"b": 1},
+        "z": np.ones(3, complex),
+        "N": values,
+    }
     scipy.io.savemat(tmp_path / "a.mat", arrays, do_compression=compressed)
     read = read_mat(tmp_path / "a.mat", None)
     np.testing.assert_array_equal(read, scipy.io.loadmat(tmp_path / "a.mat")["N"])
@@ -178,7 +219,9 @@ def test_matlab_s_byte_orders_and_undefined_types(tmp_path: Path, compressed: bo
             read_normals(path, MASK)
 
 
-def write_mat(path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool) -> Path:
+def write_mat(
+    path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool
+) -> Path:
     """Write the variable N by the description of the format, its numbers with a type."""
 
     def element(kind: int, content: bytes) -> bytes:

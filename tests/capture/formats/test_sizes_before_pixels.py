@@ -1,4 +1,6 @@
-"""Files that claim or hide far more than they show are refused from their headers, without taking memory."""
+"""Files that claim or hide far more than they show are refused from their headers, without taking
+memory.
+"""
 
 import io
 import os
@@ -28,7 +30,10 @@ from splinecli.pipeline.info import describe_capture
 
 HUGE = 30_000
 SMALL = (16, 18)
-TOO_LARGE = r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 megapixels"
+TOO_LARGE = (
+    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory;"
+    r" expected at most 400 megapixels"
+)
 MOST_GROWTH = 300 * 2**20
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
@@ -51,7 +56,11 @@ def write_jpeg(path: Path) -> None:
 
 def write_tiff(path: Path, height: int, width: int, data: bytes, *, tile: int = 0) -> None:
     """A TIFF whose only strip, or tile, is these compressed bytes."""
-    layout = [(322, tile), (323, tile), (324, 0), (325, len(data))] if tile else [(273, 0), (278, height)]
+    layout = (
+        [(322, tile), (323, tile), (324, 0), (325, len(data))]
+        if tile
+        else [(273, 0), (278, height)]
+    )
     layout += [] if tile else [(279, len(data))]
     tags = sorted([(256, width), (257, height), (258, 8), (259, 8), (262, 1), (277, 1), *layout])
     start = 8 + 2 + 12 * len(tags) + 4
@@ -73,7 +82,9 @@ def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:
     element = struct.pack("<II", 14, data + 8 + n_zeros) + bytes(matrix[: data + 8])
     packer = zlib.compressobj(1)
     packed = packer.compress(element)
-    packed += b"".join(packer.compress(bytes(1 << 20)) for _ in range(n_zeros >> 20)) + packer.flush()
+    packed += (
+        b"".join(packer.compress(bytes(1 << 20)) for _ in range(n_zeros >> 20)) + packer.flush()
+    )
     path.write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
 
 
@@ -126,7 +137,10 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> N
     sizes = "of 15000 x 15000 pixels, expected 18 x 16 as in 0.png"
     with pytest.raises(InputError, match=f"found a mask {sizes}"):
         calibrate_ball(find_ball_files(ball, mask=tmp_path / "large.png"))
-    with pytest.raises(InputError, match="a ground truth of 15000 x 15000 pixels, expected 18 x 16 as in the images"):
+    with pytest.raises(
+        InputError,
+        match="a ground truth of 15000 x 15000 pixels, expected 18 x 16 as in the images",
+    ):
         ground_truth(tmp_path / "large.png")
     with pytest.raises(InputError, match="a normal map of 18 x 16 pixels, expected 15000 x 15000"):
         read_normal_map(tmp_path / "normals.npy", tmp_path / "large.png")
@@ -136,9 +150,13 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> N
         open_capture(capture).read()
 
 
-def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_capture_larger_than_the_memory_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Six images of 361 megapixels: each would fit by itself."""
-    np.savetxt(tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)])
+    np.savetxt(
+        tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)]
+    )
     for number in range(6):
         write_claim(tmp_path / f"{number}.png", 19_000, 19_000)
     monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 5e9)
@@ -154,14 +172,19 @@ def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, i
     np.savetxt(tmp_path / "lights.txt", lights)
     for number in range(4):
         write_claim(tmp_path / f"{number}.png", *size)
-    match = rf"0\.png: found an image of {size[1]} x {size[0]} pixels.* expected at most 400 megapixels"
+    match = (
+        rf"0\.png: found an image of {size[1]} x {size[0]} pixels.* expected at most 400 megapixels"
+    )
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), match)
     refused(lambda: open_capture(tmp_path).find_mask(), match)
     refused(lambda: open_capture(tmp_path).read_mask(size), match)
     refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full(SMALL, 99 + number, np.uint8))
-    other = rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected {SMALL[1]} x {SMALL[0]} as in 0\.png"
+    other = (
+        rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected"
+        rf" {SMALL[1]} x {SMALL[0]} as in 0\.png"
+    )
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), other)
 
 
@@ -172,7 +195,9 @@ def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
     refused(lambda: ground_truth(tmp_path / "a.mat"), "the MATLAB file is damaged")
     with (tmp_path / "normal.txt").open("wb") as file:
         file.truncate(1 << 31)
-    refused(lambda: ground_truth(tmp_path / "normal.txt"), r"expected a text file of at most 1\.0 MB")
+    refused(
+        lambda: ground_truth(tmp_path / "normal.txt"), r"expected a text file of at most 1\.0 MB"
+    )
 
 
 def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
@@ -185,7 +210,9 @@ def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
 
 
 def test_headers_without_end(tmp_path: Path) -> None:
-    """Each would take seconds to minutes to walk through. The steps that are read are counted in place of time."""
+    """Each would take seconds to minutes to walk through. The steps that are read are counted in
+    place of time.
+    """
     jpeg, png, mat = (tmp_path / name for name in ("a.jpg", "a.png", "a.mat"))
     jpeg.write_bytes(b"\xff\xd8" + b"\xff" * 2_000_000)
     refused(lambda: decode_image(jpeg), "the JPEG is truncated")
@@ -209,11 +236,16 @@ def test_arrays_too_large_to_read(tmp_path: Path) -> None:
     with (tmp_path / "a.npy").open("wb") as file:
         header = {"descr": "<f8", "fortran_order": False, "shape": (HUGE, HUGE, 3)}
         np.lib.format.write_array_header_1_0(file, header)
-        file.truncate(HUGE * HUGE * 24 + file.tell())  # a sparse file, which holds nothing on the disk
-    refused(lambda: ground_truth(tmp_path / "a.npy"), "found a ground truth of 30000 x 30000 pixels")
+        # a sparse file, which holds nothing on the disk
+        file.truncate(HUGE * HUGE * 24 + file.tell())
+    refused(
+        lambda: ground_truth(tmp_path / "a.npy"), "found a ground truth of 30000 x 30000 pixels"
+    )
     refused(lambda: read_normal_map(tmp_path / "a.npy"), TOO_LARGE)
     write_mat(tmp_path / "a.mat", (HUGE, HUGE, 3), 1 << 20)
-    refused(lambda: ground_truth(tmp_path / "a.mat"), "found a ground truth of 30000 x 30000 pixels")
+    refused(
+        lambda: ground_truth(tmp_path / "a.mat"), "found a ground truth of 30000 x 30000 pixels"
+    )
     refused(lambda: read_normal_map(tmp_path / "a.mat"), TOO_LARGE)
 
 
@@ -222,7 +254,10 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
         with (tmp_path / name).open("ab") as file:
             file.truncate(1 << 31)
-        refused(lambda name=name: decode_image(tmp_path / name), r"found 2147\.5 MB, expected at most 67\.1 MB")
+        refused(
+            lambda name=name: decode_image(tmp_path / name),
+            r"found 2147\.5 MB, expected at most 67\.1 MB",
+        )
 
 
 def test_light_files_with_too_much_text(tmp_path: Path) -> None:

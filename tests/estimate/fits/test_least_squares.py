@@ -1,4 +1,6 @@
-"""Lambertian fits against LAPACK, linear programmes and pixels made by the Lambertian law; two halves of the lights."""
+"""Lambertian fits against LAPACK, linear programmes and pixels made by the Lambertian law; two
+halves of the lights.
+"""
 
 from typing import Any
 
@@ -30,8 +32,12 @@ ROBUST = ("iw12", "l1", "ls-trimmed")
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def estimate(name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]) -> NDArray[np.floating]:
-    return make_estimator(name, MethodOptions(device="cpu")).estimate(observations.astype(np.float32), lights)
+def estimate(
+    name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]
+) -> NDArray[np.floating]:
+    return make_estimator(name, MethodOptions(device="cpu")).estimate(
+        observations.astype(np.float32), lights
+    )
 
 
 @pytest.mark.parametrize("name", ROBUST)
@@ -68,7 +74,9 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
             weighted = lights / gamma[:, None]
             posterior = np.linalg.inv(lights.T @ weighted + RIDGE * np.eye(3))
             solution = posterior @ weighted.T @ pixel
-            gamma = (pixel - lights @ solution) ** 2 + np.einsum("fi,ij,fj->f", lights, posterior, lights)
+            gamma = (pixel - lights @ solution) ** 2 + np.einsum(
+                "fi,ij,fj->f", lights, posterior, lights
+            )
             gamma = gamma.clip(SMALLEST_VARIANCE)
         np.testing.assert_allclose(b, solution, rtol=1e-5)
 
@@ -108,7 +116,9 @@ def test_trimmed_ends(count: int, dropped: int) -> None:
 
 
 def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:
-    """Three directions, each many times: under IW12's weights one of them may drop out, then another."""
+    """Three directions, each many times: under IW12's weights one of them may drop out, then
+    another.
+    """
     rng = np.random.default_rng(0)
     for spanned in (1, 2, 3):
         rows = rng.normal(size=(spanned, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
@@ -123,14 +133,18 @@ def test_weighted_step_against_lapack() -> None:
     rng = np.random.default_rng(0)
     lights, observations = rng.normal(size=(7, 3)), rng.uniform(size=(5, 7))
     weight = 10.0 ** rng.uniform(-6, 6, (5, 7))
-    solution, covariance = weighted_least_squares(*(torch.tensor(a) for a in (observations, lights, weight)))
+    solution, covariance = weighted_least_squares(
+        *(torch.tensor(a) for a in (observations, lights, weight))
+    )
     for i in range(5):
         root = np.sqrt(weight[i])[:, None]
         expected = np.linalg.lstsq(root * lights, root[:, 0] * observations[i], rcond=None)[0]
         np.testing.assert_allclose(solution[i], expected, rtol=1e-6)
         inverse = np.linalg.inv((root * lights).T @ (root * lights))
         entries = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        np.testing.assert_allclose(covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse))
+        np.testing.assert_allclose(
+            covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse)
+        )
 
 
 def normals_under(limit_deg: float, count: int) -> Tensor:
@@ -142,7 +156,9 @@ def ring(count: int, zenith_deg: float) -> Tensor:
 
 
 def error_deg(scaled_normals: Tensor, truth: Tensor) -> np.ndarray:
-    return angle_between_deg(torch.nn.functional.normalize(scaled_normals, dim=1).numpy(), truth.numpy())
+    return angle_between_deg(
+        torch.nn.functional.normalize(scaled_normals, dim=1).numpy(), truth.numpy()
+    )
 
 
 def to_unit_scale(observations: Tensor) -> Tensor:
@@ -211,7 +227,9 @@ def test_inverse(library: str) -> None:
 
 def test_numpy_and_torch_agree_to_the_last_bit() -> None:
     matrices = positive_matrices(1000)
-    assert inverse(matrices, 1e-12, "numpy").tobytes() == inverse(matrices, 1e-12, "torch").tobytes()
+    assert (
+        inverse(matrices, 1e-12, "numpy").tobytes() == inverse(matrices, 1e-12, "torch").tobytes()
+    )
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
@@ -225,7 +243,10 @@ def test_inverse_of_a_singular_matrix_is_positive(rank: int, dtype: type) -> Non
 def test_product_with_a_vector() -> None:
     matrices, vectors = positive_matrices(50), np.random.default_rng(1).normal(size=(50, 3))
     entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    found, expected = multiply_symmetric(entries, vectors.T), np.einsum("pij,pj->ip", matrices, vectors)
+    found, expected = (
+        multiply_symmetric(entries, vectors.T),
+        np.einsum("pij,pj->ip", matrices, vectors),
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -234,7 +255,9 @@ SIGNS = alternating_signs(LIGHTS)
 
 
 def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-    """Normals (2000, 3) of matte pixels that no light leaves dark, and their observations (2000, F)."""
+    """Normals (2000, 3) of matte pixels that no light leaves dark, and their observations (2000,
+    F).
+    """
     generator = torch.Generator().manual_seed(2)
     across = 0.6 * (torch.rand(2000, 2, generator=generator, dtype=torch.float64) - 0.5)
     normals = normalize(pad(across, (0, 1), value=1.0), dim=1)
@@ -243,11 +266,14 @@ def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
 
 
 def test_the_change_is_half_the_difference_of_two_halves() -> None:
-    """On a ring, the sums over either half are the same. So least squares with one half is the oracle."""
+    """On a ring, the sums over either half are the same. So least squares with one half is the
+    oracle.
+    """
     lights = torch.tensor(directions_at(np.radians(30 + 45 * np.arange(8)), np.radians(40)))
     _, observations = noisy_pixels(lights, 0.001)
     first, second = (
-        normalize(observations[:, half::2] @ torch.linalg.pinv(lights[half::2]).T, dim=1) for half in (0, 1)
+        normalize(observations[:, half::2] @ torch.linalg.pinv(lights[half::2]).T, dim=1)
+        for half in (0, 1)
     )
     expected = (first - second) / 2
     found = compare_halves(observations, lights, alternating_signs(lights))
@@ -266,12 +292,16 @@ def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> Non
     lights = torch.tensor(ring if square else spiral_lights(count, 55))
     truth, observations = noisy_pixels(lights, 0.01)
     found = compare_halves(observations, lights, alternating_signs(lights))
-    noise, error = (values.square().sum(dim=1).mean().sqrt() for values in (found.noise, found.normals - truth))
+    noise, error = (
+        values.square().sum(dim=1).mean().sqrt() for values in (found.noise, found.normals - truth)
+    )
     assert noise == pytest.approx(float(error), rel=0.07)  # means of 2,000 squares
 
 
 def test_errors_that_all_pixels_share_are_no_noise() -> None:
-    """Wrong intensities turn all normals alike. What the halves disagree about is as smooth as the normals are."""
+    """Wrong intensities turn all normals alike. What the halves disagree about is as smooth as the
+    normals are.
+    """
     truth, observations = noisy_pixels(LIGHTS, 0.0)
     noise = compare_halves(observations * torch.linspace(0.8, 1.3, 10), LIGHTS, SIGNS).noise
     assert noise.abs().mean() > 0.01
@@ -294,4 +324,6 @@ def test_three_lights_and_black_pixels_disagree_about_nothing() -> None:
     found = compare_halves(noisy_pixels(LIGHTS[:3], 0.01)[1], LIGHTS[:3], SIGNS[:3])
     assert found.change.abs().max() < 1e-6
     assert found.noise.isfinite().all()
-    assert not torch.cat(compare_halves(torch.zeros(2, 10, dtype=torch.float64), LIGHTS, SIGNS), dim=1).any()
+    assert not torch.cat(
+        compare_halves(torch.zeros(2, 10, dtype=torch.float64), LIGHTS, SIGNS), dim=1
+    ).any()

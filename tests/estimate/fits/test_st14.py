@@ -1,4 +1,6 @@
-"""ST14 and IA14, on scenes that obey their models; the solver of IA14 against quadratic programmes and SciPy."""
+"""ST14 and IA14, on scenes that obey their models; the solver of IA14 against quadratic programmes
+and SciPy.
+"""
 
 from math import comb
 
@@ -25,13 +27,18 @@ def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
 
 
 def bipolynomial(normals: Array, lights: Array) -> Array:
-    """Observations (P, F) under nine random coefficients a pixel, as the model's definition has it."""
+    """Observations (P, F) under nine random coefficients a pixel,
+    as the model's definition has it.
+    """
     half, difference = half_cosines(normals, lights)
     coefficients = np.random.default_rng(5).uniform(-0.3, 0.3, (len(normals), 3, 3))
     coefficients[:, 0, 0] = 1
     powers = np.arange(3)
     reflectance: Array = np.einsum(
-        "pab,pfa,fb->pf", coefficients, (1 - half[..., None]) ** powers, (1 - difference[..., None]) ** powers
+        "pab,pfa,fb->pf",
+        coefficients,
+        (1 - half[..., None]) ** powers,
+        (1 - difference[..., None]) ** powers,
     )
     return reflectance * (normals @ lights.T)
 
@@ -92,7 +99,10 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouc
     noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
     observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
     error = angle_between_deg(estimate(observations, lights), TRUTH).mean()
-    assert error < 0.25 * angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH).mean()
+    assert (
+        error
+        < 0.25 * angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH).mean()
+    )
 
 
 Array = NDArray[np.float64]
@@ -100,21 +110,30 @@ ON_CPU = MethodOptions(device="cpu")
 
 
 def bernstein(x: Array, degree: int) -> Array:
-    return np.stack([comb(degree, i) * x**i * (1 - x) ** (degree - i) for i in range(degree + 1)], axis=-1)
+    return np.stack(
+        [comb(degree, i) * x**i * (1 - x) ** (degree - i) for i in range(degree + 1)], axis=-1
+    )
 
 
 def rendered(normals: Array, lights: Array, seed: int) -> Array:
-    """Diffuse and a Blinn-Phong highlight of random strength and width, with attached shadows; largest 1."""
+    """Diffuse and a Blinn-Phong highlight of random strength and width, with attached shadows;
+    largest 1.
+    """
     rng = np.random.default_rng(seed)
     strength, exponent = rng.uniform(0, 2, (len(normals), 1)), rng.uniform(5, 80, (len(normals), 1))
     shading = (normals @ lights.T).clip(0)
-    observations: Array = shading * (1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent)
+    observations: Array = shading * (
+        1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent
+    )
     return observations / observations.max(axis=1, keepdims=True)
 
 
 def test_lambertian_is_exact() -> None:
     for count in (4, 10, 96):
-        truth, lights = cap_directions(300, 70, 0, even=True), cap_directions(count, 60, 1, even=True)
+        truth, lights = (
+            cap_directions(300, 70, 0, even=True),
+            cap_directions(count, 60, 1, even=True),
+        )
         observations = (truth @ lights.T).clip(0)
         truth = truth[(observations > 0).sum(axis=1) >= 4]
         observations = (truth @ lights.T).clip(0) * 7
@@ -127,10 +146,11 @@ def test_lambertian_is_exact() -> None:
 def objective_of(
     intensities: Array, lights: Array, prior_weight: float
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """The whole programme of one pixel, over x = (n, c_10 .. c_24): no variable eliminated, no increments.
+    """The whole programme of one pixel, over x = (n, c_10 .. c_24): no variable eliminated, no
+    increments.
 
-    Returns H with the objective x'Hx / 2, the mean of g as a row m'x, the monotonicity as C x >= 0, and which
-    lights are used.
+    Returns H with the objective x'Hx / 2, the mean of g as a row m'x, the monotonicity as C x >= 0,
+    and which lights are used.
     """
     floor = min(0.2 * np.quantile(intensities, 0.6), np.sort(intensities)[-3])
     used = (intensities >= floor) & (intensities > 0)
@@ -159,7 +179,8 @@ def test_optimum_is_the_librarys(kind: str, count: int) -> None:
     normals, increments = fit(torch.as_tensor(observations), torch.as_tensor(lights))
     for intensities, n, d in zip(observations, normals.numpy(), increments.numpy(), strict=True):
         hessian, mean, monotone, used = objective_of(intensities, lights, prior_weight=0.01)
-        # On the constraint mean'x = 1 the added term is constant; the library asks for a definite hessian.
+        # On the constraint mean'x = 1 the added term is constant; the library asks for a definite
+        # hessian.
         definite = hessian + np.outer(mean, mean) + 1e-10 * np.eye(13)
         constraints = np.concatenate((mean[None], monotone)).T
         bounds = np.array([1.0] + [0.0] * 10)

@@ -13,7 +13,13 @@ from torch import Tensor
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.distilled import DistilledEstimator, Perceptron, distil, draw_sample
-from splinecli.estimate.methods.estimator import UNKNOWN_ERROR, LeastSquares, StudentSize, confidence, student_sizes
+from splinecli.estimate.methods.estimator import (
+    UNKNOWN_ERROR,
+    LeastSquares,
+    StudentSize,
+    confidence,
+    student_sizes,
+)
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -52,7 +58,11 @@ def log_median(degrees: float) -> tuple[float, float]:
 
 def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
     """Return normals turned by about so many degrees."""
-    noise = np.random.default_rng(seed).normal(size=normals.shape) * math.radians(degrees) / math.sqrt(math.pi / 2)
+    noise = (
+        np.random.default_rng(seed).normal(size=normals.shape)
+        * math.radians(degrees)
+        / math.sqrt(math.pi / 2)
+    )
     return unit(normals + noise - normals * (normals * noise).sum(axis=1, keepdims=True))
 
 
@@ -66,7 +76,9 @@ def distant(observations: NDArray[np.float32]) -> LightingAt:
 
 
 def learn(teacher: Remembering, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
-    return distil(teacher, distant(teacher.observations), len(teacher.observations), size, **options)
+    return distil(
+        teacher, distant(teacher.observations), len(teacher.observations), size, **options
+    )
 
 
 def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2) -> Remembering:
@@ -88,12 +100,16 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
     assert told.expected_deg == pytest.approx(4, abs=0.2)
     assert told.held_out == pytest.approx(told.sample / 8, abs=1)
     assert teacher.asked == told.sample + found.n_unlike < 1800
-    np.testing.assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("followed", [True, False])
 def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> None:
-    """The teacher says something else of the new observations. If that is noise, the teacher stays."""
+    """The teacher says something else of the new observations. If that is noise,
+    the teacher stays.
+    """
     normals, observations = glossy()
     changed = observations**2
     said = normals[:, [1, 0, 2]] if followed else noisy(normals, 40)
@@ -108,7 +124,9 @@ def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> 
 
 
 def test_lamps_near_a_plane_of_bumps() -> None:
-    """Lamps at two widths: their light turns by 25 degrees over the plane, which no single set of lights explains."""
+    """Lamps at two widths: their light turns by 25 degrees over the plane, which no single set of
+    lights explains.
+    """
     rng = np.random.default_rng(8)
     points = np.concatenate((rng.uniform(-1, 1, (8000, 2)), np.zeros((8000, 1))), axis=1)
     normals = cap_directions(8000, 40)[rng.permutation(8000)]
@@ -117,7 +135,9 @@ def test_lamps_near_a_plane_of_bumps() -> None:
     shading = np.einsum("pfc,pc->pf", directions, normals).clip(0)
     observations = (shading + 0.3 * shading**8).astype(np.float32)
     teacher = sure(observations, noisy(normals, 4), 4)
-    found = distil(teacher, lambda rows: PixelLighting(observations[rows], directions[rows]), 8000, SIZE)
+    found = distil(
+        teacher, lambda rows: PixelLighting(observations[rows], directions[rows]), 8000, SIZE
+    )
     error_deg = angle_between_deg(found.estimate(observations, directions), normals).mean()
     assert error_deg < 4 / 2
     assert angle_between_deg(LeastSquares().estimate(observations, directions), normals).mean() > 4
@@ -134,7 +154,10 @@ def test_gradient_against_autograd(near: bool) -> None:
     for parameter in perceptron.parameters():
         torch.nn.init.normal_(parameter, std=0.3, generator=generator)
     inputs = perceptron.inputs(torch.tensor(observations), lights)
-    targets = torch.tensor(normals, dtype=torch.float32), torch.randn(len(normals), 2, generator=generator)
+    targets = (
+        torch.tensor(normals, dtype=torch.float32),
+        torch.randn(len(normals), 2, generator=generator),
+    )
     with torch.no_grad():
         found = perceptron.gradient(inputs, *targets)
     estimate, errors = perceptron(inputs)
@@ -185,7 +208,9 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)
-    first, again, other = (learn(teacher, SMALL, seed=seed).estimate(observations, LIGHTS) for seed in (1, 1, 2))
+    first, again, other = (
+        learn(teacher, SMALL, seed=seed).estimate(observations, LIGHTS) for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
     assert torch.equal(torch.rand(3), expected)
@@ -229,7 +254,12 @@ def test_rare_kinds_are_in_the_sample() -> None:
 def test_the_first_rows_are_an_even_sample() -> None:
     """The far cluster has its share of them, 0.4 %, and not more."""
     counts = [
-        int((draw_sample(clusters(), 1200, torch.Generator().manual_seed(seed)).rows[:600] >= 5000).sum())
+        int(
+            (
+                draw_sample(clusters(), 1200, torch.Generator().manual_seed(seed)).rows[:600]
+                >= 5000
+            ).sum()
+        )
         for seed in range(8)
     ]
     # Poisson of mean 20.1 in all: three standard deviations either way.

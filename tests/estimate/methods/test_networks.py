@@ -1,4 +1,5 @@
-"""SPLINE-Net as an estimator, the weights of the package, and the compared methods on two objects of DiLiGenT.
+"""SPLINE-Net as an estimator, the weights of the package, and the compared methods on two objects
+of DiLiGenT.
 
 The published errors are those of the papers and of the benchmark.
 """
@@ -53,7 +54,9 @@ def test_rotations_of_a_canonical_network() -> None:
     assert rotations_of(1, canonical=True) == [(0, False)]
     assert rotations_of(2, canonical=True) == [(0, False), (0, True)]
     assert rotations_of(4, canonical=True) == [(-10, False), (-10, True), (10, False), (10, True)]
-    assert rotations_of(6, canonical=True) == [(t, m) for t in (-10.0, 0.0, 10.0) for m in (False, True)]
+    assert rotations_of(6, canonical=True) == [
+        (t, m) for t in (-10.0, 0.0, 10.0) for m in (False, True)
+    ]
     for rotations in range(1, 20):
         several = rotations_of(rotations, canonical=True)
         assert len(set(several)) == rotations
@@ -67,14 +70,20 @@ QUARTER, MIRROR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.diag((1.0, 
 
 
 @pytest.mark.parametrize(
-    ("settings", "turn", "symmetric_from"), [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)]
+    ("settings", "turn", "symmetric_from"),
+    [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)],
 )
 def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from) -> None:
-    """Four make the paper's fourfold symmetric, for turned lights only change their order; two make ours a mirror."""
+    """Four make the paper's fourfold symmetric, for turned lights only change their order; two make
+    ours a mirror.
+    """
     observations, lights = pixels(4)
     for rotations in (symmetric_from, 1):
         network = estimator(random_network(**settings), rotations=rotations)
-        here, there = network.estimate(observations, lights), network.estimate(observations, lights @ turn.T)
+        here, there = (
+            network.estimate(observations, lights),
+            network.estimate(observations, lights @ turn.T),
+        )
         assert np.allclose(there, here @ turn.T, atol=1e-4) == (rotations > 1)
 
 
@@ -118,7 +127,9 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     expected = network.estimate(observations, lights)
     dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
     with_background = np.concatenate((dark[:400], observations, dark[400:]))
-    found = network.bind(lighting_at(with_background, lights), row(1000)).estimate(with_background, lights)
+    found = network.bind(lighting_at(with_background, lights), row(1000)).estimate(
+        with_background, lights
+    )
     assert angle_between_deg(found[400:600], expected).max() < 0.01
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
@@ -153,11 +164,16 @@ def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_ot
     normals, inside = sphere(size * factor)
 
     def photographed(values: NDArray[np.floating]) -> NDArray[np.floating]:
-        return np.asarray((values * inside[..., None]).reshape(size, factor, size, factor, -1).mean(axis=(1, 3)))
+        return np.asarray(
+            (values * inside[..., None]).reshape(size, factor, size, factor, -1).mean(axis=(1, 3))
+        )
 
     covered = photographed(np.ones((*inside.shape, 1)))[..., 0]
     mask = covered > 0.3
-    truth, seen = unit(photographed(normals)[mask]), photographed(shade(normals, lights, gloss=0.5))[mask]
+    truth, seen = (
+        unit(photographed(normals)[mask]),
+        photographed(shade(normals, lights, gloss=0.5))[mask],
+    )
     network, observations = make_estimator("spline-net-pixelwise"), seen.astype(np.float32)
     bound = network.bind(lighting_at(observations, lights), mask)
     whole, alone = (
@@ -173,8 +189,9 @@ def test_methods_that_see_no_capture_stay_as_they_are() -> None:
         assert method.bind(lighting_at(observations, lights), row(20)) is method
 
 
-# Mean angular errors in degrees, on Ball and Cat: ours, and the published ones. The published ones for all 96 lights
-# are DiLiGenT's benchmark, those for ten lights are table 2 of Zheng et al. (ICCV 2019).
+# Mean angular errors in degrees, on Ball and Cat: ours, and the published ones. The published ones
+# for all 96 lights are DiLiGenT's benchmark, those for ten lights are table 2 of Zheng et al. (ICCV
+# 2019).
 ALL_LIGHTS = {
     "ls": ((4.44, 8.00), (4.10, 8.41)),
     "iw12": ((2.11, 6.49), (2.54, 7.21)),
@@ -190,11 +207,14 @@ TEN_LIGHTS = {
 }
 
 REPEATED_DEG = 0.1
-"""Tolerance of our own errors. Draws and pixels are seeded, so only rounding differs between machines."""
+"""Tolerance of our own errors. Draws and pixels are seeded, so only rounding differs between
+machines.
+"""
 
 PUBLISHED_DEG = 0.5
-"""How much worse than the published errors ours may be: the images have 16 bits and one channel, and only some pixels
-are scored. Ours may be better: ST14 and IA14 have priors here that ten lights need."""
+"""How much worse than the published errors ours may be: the images have 16 bits and one channel,
+and only some pixels are scored. Ours may be better: ST14 and IA14 have priors here that ten lights
+need."""
 
 OBJECTS = pytest.mark.parametrize(("place", "name"), [(0, "ballPNG"), (1, "catPNG")])
 
@@ -202,7 +222,9 @@ OBJECTS = pytest.mark.parametrize(("place", "name"), [(0, "ballPNG"), (1, "catPN
 @OBJECTS
 def test_all_lights(shared_data: Path, place: int, name: str) -> None:
     errors = mean_errors(
-        shared_data / f"DiLiGenT/pmsData/{name}", [*ALL_LIGHTS], Protocol(max_pixels=1000, as_stored=True)
+        shared_data / f"DiLiGenT/pmsData/{name}",
+        [*ALL_LIGHTS],
+        Protocol(max_pixels=1000, as_stored=True),
     )
     check(errors, ALL_LIGHTS, place)
     # Least squares must not pass as one of the robust methods.
@@ -215,7 +237,9 @@ def test_ten_lights(shared_data: Path, place: int, name: str) -> None:
     fits = [method for method in TEN_LIGHTS if method != "cnn-ps"]
     errors = mean_errors(folder, fits, Protocol(10, trials=10, max_pixels=500, as_stored=True))
     # CNN-PS averages ten rotations of each pixel, so it gets fewer pixels.
-    errors |= mean_errors(folder, ["cnn-ps"], Protocol(10, trials=3, max_pixels=150, as_stored=True))
+    errors |= mean_errors(
+        folder, ["cnn-ps"], Protocol(10, trials=3, max_pixels=150, as_stored=True)
+    )
     check(errors, TEN_LIGHTS, place)
     assert all(errors[method] < errors["ls"] - 1 for method in ("iw12", "st14", "ia14"))
     # With ten lights CNN-PS is worse than least squares, in its paper as here.
@@ -230,7 +254,9 @@ def mean_errors(folder: Path, methods: list[str], protocol: Protocol) -> dict[st
 
 
 def check(
-    errors: dict[str, float], table: dict[str, tuple[tuple[float, float], tuple[float, float]]], place: int
+    errors: dict[str, float],
+    table: dict[str, tuple[tuple[float, float], tuple[float, float]]],
+    place: int,
 ) -> None:
     ours = {method: own[place] for method, (own, _) in table.items()}
     assert errors == pytest.approx(ours, abs=REPEATED_DEG)
@@ -242,13 +268,19 @@ GOLDEN = Path(__file__).resolve().parents[2] / "golden/shipped_predictions.json"
 
 
 def glossy_pixels(n_lights: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals (25, 3), lights (F, 3) on a spiral, and observations (25, F): Lambert's cosine and a Phong lobe."""
+    """Normals (25, 3), lights (F, 3) on a spiral, and observations (25, F): Lambert's cosine and a
+    Phong lobe.
+    """
     grid = np.linspace(-0.7, 0.7, 5)
     x, y = (axis.ravel() for axis in np.meshgrid(grid * 0.9, grid * 0.9))
     normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
     radius = 0.8 * np.sqrt((np.arange(n_lights) + 0.5) / n_lights)
     lights = directions_at(2.4 * np.arange(n_lights), np.arcsin(radius))
-    return normals, lights, (0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)).astype(np.float32)
+    return (
+        normals,
+        lights,
+        (0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)).astype(np.float32),
+    )
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))
@@ -263,7 +295,9 @@ def test_file(name):
 @pytest.mark.parametrize("n_lights", [8, 96])
 def test_glossy_pixels_are_better_than_by_least_squares(n_lights):
     normals, lights, observations = glossy_pixels(n_lights)
-    estimators = [make_estimator(name, MethodOptions(precision="float32")) for name in ("spline-net", "ls")]
+    estimators = [
+        make_estimator(name, MethodOptions(precision="float32")) for name in ("spline-net", "ls")
+    ]
     ours, plain = (estimator.estimate(observations, lights) for estimator in estimators)
     assert angle_between_deg(ours, normals).mean() < angle_between_deg(plain, normals).mean()
 
@@ -280,14 +314,18 @@ def test_confidence_on_generated_pixels():
     error_deg = angle_between_deg(normals.numpy(), truth.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()
     for fifth in np.array_split(confidence.argsort(), 5):
-        assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(confidence[fifth].mean(), abs=0.06)
+        assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(
+            confidence[fifth].mean(), abs=0.06
+        )
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))
 def test_stored_prediction(name, request):
     """The numbers of these very files; `pytest --update-golden` after new weights."""
     _, lights, observations = glossy_pixels(10)
-    estimated = make_estimator(name, MethodOptions(precision="float32")).estimate(observations, lights)
+    estimated = make_estimator(name, MethodOptions(precision="float32")).estimate(
+        observations, lights
+    )
     stored = json.loads(GOLDEN.read_text("utf-8"))
     if request.config.getoption("--update-golden"):
         stored[name] = np.round(estimated, 4).tolist()

@@ -1,4 +1,6 @@
-"""Methods by name, and what must not change their answers: order of lights, scale of images, size of batches."""
+"""Methods by name, and what must not change their answers: order of lights, scale of images, size
+of batches.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,11 +44,14 @@ def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path
     fingerprints = set()
     for name in method_names():
         file = alone if name == "cnn-ps" else weights
-        estimator = make_estimator(name, MethodOptions(weights=file, device="cpu", precision="float32"))
+        estimator = make_estimator(
+            name, MethodOptions(weights=file, device="cpu", precision="float32")
+        )
         assert estimator.name == name
         assert estimator.device == "cpu"
         fingerprints.add(estimator.fingerprint)
-        # A matte pixel without shadow is easy for all of them; the network starts from the Lambertian fit.
+        # A matte pixel without shadow is easy for all of them; the network starts from the
+        # Lambertian fit.
         normals = estimator.estimate(observations, LIGHTS)
         assert normals.shape == (3, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
@@ -66,8 +71,16 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
 def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
     for method, file, message in (
-        ("cnn-ps", weights, "'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net"),
-        ("spline-net", alone, "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps"),
+        (
+            "cnn-ps",
+            weights,
+            "'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net",
+        ),
+        (
+            "spline-net",
+            alone,
+            "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps",
+        ),
     ):
         with pytest.raises(ModelError, match=message):
             make_estimator(method, MethodOptions(weights=file))
@@ -87,7 +100,9 @@ SEE_CAPTURE = ("spline-net", "spline-net-pixelwise")
 
 
 def make(name: str, batch_size: int | None = None) -> Estimator:
-    return make_estimator(name, MethodOptions(device="cpu", precision="float32", batch_size=batch_size))
+    return make_estimator(
+        name, MethodOptions(device="cpu", precision="float32", batch_size=batch_size)
+    )
 
 
 def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
@@ -97,7 +112,9 @@ def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> 
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
 def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> None:
-    """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten rotations go."""
+    """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten
+    rotations go.
+    """
     _, lights, observations = glossy_pixels
     order, turn = np.arange(len(lights)), np.eye(3)
     if change == "order of lights":
@@ -131,14 +148,19 @@ def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: 
 
 @pytest.mark.parametrize("name", method_names())
 def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) -> None:
-    """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights of their own.
+    """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights
+    of their own.
 
     Both see the same capture, if they see one at all.
     """
     _, lights, observations = glossy_pixels
     some = observations[:6].astype(np.float32)
-    turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
-    method = make(name).bind(lambda rows: PixelLighting(some[rows], turned[rows]), np.ones((1, len(some)), np.bool_))
+    turned = np.stack(
+        [lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)]
+    )
+    method = make(name).bind(
+        lambda rows: PixelLighting(some[rows], turned[rows]), np.ones((1, len(some)), np.bool_)
+    )
     together = method.estimate(some, turned)
     pairs = [method.estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
     assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05
@@ -157,4 +179,6 @@ def test_solves_the_normal_equations(count: int) -> None:
     directions = spiral_lights(count)
     estimate = LeastSquares().estimate(observations, directions)
     expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
-    np.testing.assert_allclose(estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12)
+    np.testing.assert_allclose(
+        estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12
+    )

@@ -1,7 +1,8 @@
 """The paper's size: its published numbers of parameters, and the authors' weights.
 
-The authors' architecture, built here from its description, is the oracle of the import: both networks get random
-weights, are saved as the authors save theirs, imported, and asked the same questions.
+The authors' architecture, built here from its description, is the oracle of the import: both
+networks get random weights, are saved as the authors save theirs, imported, and asked the same
+questions.
 """
 
 import pickle
@@ -42,7 +43,9 @@ def joined(conv: nn.Module, channels: int) -> list[nn.Module]:
 
 
 class AuthorsLINet(nn.Module):
-    """G: always in training mode, where an instance norm that tracks statistics does not use them."""
+    """G: always in training mode, where an instance norm that tracks statistics does not use
+    them.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,7 +74,9 @@ class AuthorsNENet(nn.Module):
         super().__init__()
 
         def grow(channels: int) -> nn.Sequential:
-            return nn.Sequential(nn.ReLU(), nn.Conv2d(channels, 16, 3, padding=1), nn.Dropout2d(0.2))
+            return nn.Sequential(
+                nn.ReLU(), nn.Conv2d(channels, 16, 3, padding=1), nn.Dropout2d(0.2)
+            )
 
         self.conv1 = nn.Conv2d(2, 16, 3, padding=1)
         self.denseblock1_1, self.denseblock1_2 = grow(16), grow(32)
@@ -102,7 +107,9 @@ def authors() -> Authors:
         torch.manual_seed(3)
         li_net, ne_net = AuthorsLINet(), AuthorsNENet()
         for name, tensor in li_net.state_dict().items():
-            if tensor.is_floating_point() and tensor.ndim == 1:  # scales, offsets, tracked statistics
+            if (
+                tensor.is_floating_point() and tensor.ndim == 1
+            ):  # scales, offsets, tracked statistics
                 tensor.uniform_(0.5, 2.0) if "var" in name or "weight" in name else tensor.normal_()
         li_net.main[-2].weight.data *= 5  # so that the sigmoid's answers differ
     return li_net.requires_grad_(False), ne_net.eval().requires_grad_(False)
@@ -125,7 +132,9 @@ def imported(files: Files) -> SplineNet:
 
 @pytest.fixture
 def changed(authors: Authors, files: Files, tmp_path: Path) -> Callable[..., Files]:
-    """Save LI-Net's state (NE-Net's with of=1) with tensors replaced, or left out where None is given."""
+    """Save LI-Net's state (NE-Net's with of=1) with tensors replaced, or left out where None is
+    given.
+    """
 
     def change(changes: dict[str, Tensor | None], of: int = 0) -> Files:
         state = {**authors[of].state_dict(), **changes}
@@ -141,14 +150,18 @@ def maps(seed: int, channels: int = 1) -> Tensor:
 
 
 def embed(observations: Tensor, lights: Tensor) -> Tensor:
-    """Their observation maps (P, 1, 32, 32): q * 32 + p, with p from x and q from y, floor((n + 1) 31 / 2)."""
+    """Their observation maps (P, 1, 32, 32): q * 32 + p, with p from x and q from y, floor((n + 1)
+    31 / 2).
+    """
     p, q = np.int32(0.5 * (lights.numpy()[:, :2] + 1) * (SIDE - 1)).T
     filled = np.zeros((len(observations), SIDE * SIDE), np.float32)
     filled[:, q * SIDE + p] = (observations / observations.amax(1, keepdim=True)).numpy()
     return torch.as_tensor(filled).view(-1, 1, SIDE, SIDE)
 
 
-def test_observations_give_the_normals_that_theirs_give(authors: Authors, imported: SplineNet) -> None:
+def test_observations_give_the_normals_that_theirs_give(
+    authors: Authors, imported: SplineNet
+) -> None:
     generator = torch.Generator().manual_seed(4)
     observations = torch.rand(6, 10, generator=generator) * 3
     lights = torch.randn(10, 3, generator=generator).abs() * torch.tensor((1.0, 1.0, 1.5))
@@ -170,14 +183,24 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
     # PyTorch 0.4 wrote another container, and did not count the batches at first.
     old = tmp_path / "old-G.ckpt", tmp_path / "old-D.ckpt"
     for network, path in zip(authors, old, strict=True):
-        uncounted = (name for name in network.state_dict() if not name.endswith("num_batches_tracked"))
+        uncounted = (
+            name for name in network.state_dict() if not name.endswith("num_batches_tracked")
+        )
         state = {name: network.state_dict()[name] for name in uncounted}
         torch.save(state, path, _use_new_zipfile_serialization=False)
-    tracked = dict.fromkeys(name for name in authors[0].state_dict() if "running" in name or "num_batches" in name)
+    tracked = dict.fromkeys(
+        name for name in authors[0].state_dict() if "running" in name or "num_batches" in name
+    )
     assert len(tracked) == 3 * 17
     for paths in (old, changed(tracked)):
         again = import_official(*paths).state_dict()
-        assert all(torch.equal(again.pop(name), tensor) for name, tensor in imported.state_dict().items()) and not again
+        assert (
+            all(
+                torch.equal(again.pop(name), tensor)
+                for name, tensor in imported.state_dict().items()
+            )
+            and not again
+        )
 
 
 @pytest.mark.parametrize(
@@ -186,16 +209,36 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
         (0, {"main.0.weight": None}, "has no 'main.0.weight'"),
         (0, {"main.9.main.4.bias": None}, "has no 'main.9.main.4.bias'"),
         (0, {"main.0.bias": torch.zeros(64)}, "has 'main.0.bias', which the network does not have"),
-        (0, {"main.3.weight": torch.zeros(128, 64, 3, 3)}, r"\(128, 64, 3, 3\), expected \(128, 64, 4, 4\)"),
-        (0, {"main.1.running_mean": torch.zeros(63)}, r"'main.1.running_mean' has the shape \(63,\)"),
-        (0, {"main.1.num_batches_tracked": torch.zeros(1)}, r"num_batches_tracked' has the shape \(1,\)"),
-        (0, {"main.1.bias": torch.full((64,), torch.nan)}, "'main.1.bias' has values that are not finite"),
+        (
+            0,
+            {"main.3.weight": torch.zeros(128, 64, 3, 3)},
+            r"\(128, 64, 3, 3\), expected \(128, 64, 4, 4\)",
+        ),
+        (
+            0,
+            {"main.1.running_mean": torch.zeros(63)},
+            r"'main.1.running_mean' has the shape \(63,\)",
+        ),
+        (
+            0,
+            {"main.1.num_batches_tracked": torch.zeros(1)},
+            r"num_batches_tracked' has the shape \(1,\)",
+        ),
+        (
+            0,
+            {"main.1.bias": torch.full((64,), torch.nan)},
+            "'main.1.bias' has values that are not finite",
+        ),
         (0, {"main.1.bias": torch.full((64,), 1e6)}, "'main.1.bias' has values .* too large"),
         (0, {"main.1.bias": torch.zeros(64, dtype=torch.int64)}, "'main.1.bias' is of torch.int64"),
         (1, {"conv2.bias": None, "dense.1.weight": None}, "has no 'conv2.bias', 'dense.1.weight'"),
         (1, {"dense.0.weight": torch.zeros(128, 80)}, "'dense.0.weight' has the shape"),
         (1, {"dense.2.weight": torch.zeros(1)}, "has 'dense.2.weight'"),
-        (1, {f"{n}": torch.zeros(1) for n in range(7)}, "has '0', '1', '2', '3', '4' and 2 more tensors,"),
+        (
+            1,
+            {f"{n}": torch.zeros(1) for n in range(7)},
+            "has '0', '1', '2', '3', '4' and 2 more tensors,",
+        ),
     ],
 )
 def test_tensors_that_do_not_fit(changed, of, changes, message):
@@ -221,7 +264,11 @@ def countless_records(path: Path) -> None:
 
 def countless_tensors(path: Path, new: bool = True) -> None:
     empty = torch.zeros(0)
-    torch.save({str(number): empty[:0] for number in range(25_000)}, path, _use_new_zipfile_serialization=new)
+    torch.save(
+        {str(number): empty[:0] for number in range(25_000)},
+        path,
+        _use_new_zipfile_serialization=new,
+    )
 
 
 OLD_TENSORS = partial(countless_tensors, new=False)
@@ -243,14 +290,28 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
 
     path = tmp_path / "odd.ckpt"
     whole = files[0].read_bytes()
-    contents = [b"", b"not a checkpoint\n", b"\0" * 64, whole[:1000], whole[:-1000], pickle.dumps(Bomb())]
+    contents = [
+        b"",
+        b"not a checkpoint\n",
+        b"\0" * 64,
+        whole[:1000],
+        whole[:-1000],
+        pickle.dumps(Bomb()),
+    ]
     contents += [b"PK\x03\x04" + b"\0" * 100, pickle.dumps({"weight": 1})]
     for content in contents:
         path.write_bytes(content)
         with pytest.raises(ModelError, match="not a PyTorch checkpoint, or damaged"):
             import_official(path, files[1])
     without_numbers = {"a": torch.zeros(3).to_sparse()}, {"a": torch.zeros(3, device="meta")}
-    for value in (torch.zeros(3), {"main.0.weight": 3}, {3: torch.zeros(1)}, ["main"], None, *without_numbers):
+    for value in (
+        torch.zeros(3),
+        {"main.0.weight": 3},
+        {3: torch.zeros(1)},
+        ["main"],
+        None,
+        *without_numbers,
+    ):
         torch.save(value, path)
         with pytest.raises(ModelError, match="not a state dictionary"):
             import_official(path, files[1])
@@ -258,7 +319,10 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="not a PyTorch checkpoint"):
         import_official(path, files[1])
     assert not (tmp_path / "exploded").exists()
-    for missing, reason in ((tmp_path / "none.ckpt", "the file does not exist"), (tmp_path, "found a folder")):
+    for missing, reason in (
+        (tmp_path / "none.ckpt", "the file does not exist"),
+        (tmp_path, "found a folder"),
+    ):
         with pytest.raises(ModelError, match=reason):
             import_official(missing, files[1])
 
@@ -267,6 +331,10 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     ("network", "theirs", "published"),
     [(PaperLINet(), AuthorsLINet(), 8.40), (PaperNENet(2, 32), AuthorsNENet(), 2.65)],
 )
-def test_the_published_number_of_parameters(network: nn.Module, theirs: nn.Module, published: float) -> None:
-    count, expected = (sum(parameter.numel() for parameter in one.parameters()) for one in (network, theirs))
+def test_the_published_number_of_parameters(
+    network: nn.Module, theirs: nn.Module, published: float
+) -> None:
+    count, expected = (
+        sum(parameter.numel() for parameter in one.parameters()) for one in (network, theirs)
+    )
     assert count == expected and count / 1e6 == pytest.approx(published, abs=0.01)

@@ -1,4 +1,6 @@
-"""The refinement net: symmetries, the mask, how far it sees; pixels see their own capture, and no others."""
+"""The refinement net: symmetries, the mask, how far it sees; pixels see their own capture, and no
+others.
+"""
 
 import pytest
 import torch
@@ -7,7 +9,14 @@ from torch import Tensor
 from distributions import generator as seeded
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.config import NetworkConfig
-from splinecli.estimate.networks.refine_net import CHANNELS, COARSEST, RefineNet, channels, split_features, with_refined
+from splinecli.estimate.networks.refine_net import (
+    CHANNELS,
+    COARSEST,
+    RefineNet,
+    channels,
+    split_features,
+    with_refined,
+)
 from splinecli.estimate.networks.set_branch import ContextLayer
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.refinement.features import Turn, refine_features, turn_features, turn_maps
@@ -34,7 +43,9 @@ def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]
 
 
 def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
-    """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H, W)."""
+    """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H,
+    W).
+    """
     rows = [maps.flatten(1).T.contiguous() for maps in (observations, normals, error)]
     features = refine_features(rows[0], lights, rows[1], rows[2], 0.7, alternating_signs(lights))
     return features.T.view(-1, *observations.shape[1:])
@@ -47,7 +58,10 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     lights = torch.nn.functional.normalize(
         torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
     )
-    normals = torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
+    normals = (
+        torch.randn(3, HEIGHT, WIDTH, generator=generator)
+        + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
+    )
     normals = torch.nn.functional.normalize(normals, dim=0)
     error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
     shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
@@ -63,7 +77,9 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     def moved(maps: Tensor) -> Tensor:
         return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
 
-    expected = features_of(moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error))
+    expected = features_of(
+        moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error)
+    )
     turn = Turn(quarters, mirror)
     features = features_of(observations, lights, normals, error)
     found = turn_features(features, turn)
@@ -89,13 +105,16 @@ def test_a_second_net_reads_the_results_of_the_first() -> None:
     both = random_net(twice=True)
     assert both.again is not None
     first = RefineNet()
-    first.load_state_dict({name: value for name, value in both.state_dict().items() if "again" not in name})
+    first.load_state_dict(
+        {name: value for name, value in both.state_dict().items() if "again" not in name}
+    )
     normals, error = first(features, mask)
     changed = with_refined(features, normals, error)
     torch.testing.assert_close(split_features(changed), (normals, error))
     for fit in ("robust", "plain"):  # the fits themselves stay
         torch.testing.assert_close(
-            changed[:, channels(fit)] + normals, features[:, channels(fit)] + features[:, channels("normal")]
+            changed[:, channels(fit)] + normals,
+            features[:, channels(fit)] + features[:, channels("normal")],
         )
     found = both(features, mask, (slice(0, 8), slice(8, 16)))
     for part, whole in zip(found, both.again(changed * mask, mask), strict=True):
@@ -149,13 +168,17 @@ def network() -> SplineNet:
 
 
 def test_at_first_a_capture_says_nothing() -> None:
-    alone, seeing = (SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True))
+    alone, seeing = (
+        SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True)
+    )
     for parameter in alone.parameters():  # the layers that are zero at first, too
         torch.nn.init.normal_(parameter, std=0.1) if not parameter.any() else None
     assert not seeing.load_state_dict(alone.state_dict(), strict=False).unexpected_keys
     assert alone.encode_context(*pixels(3)) is None
     observations, lights = pixels(12)
-    for found, expected in zip(seeing(observations, lights), alone(observations, lights), strict=True):
+    for found, expected in zip(
+        seeing(observations, lights), alone(observations, lights), strict=True
+    ):
         assert torch.equal(found, expected)
 
 
@@ -164,8 +187,12 @@ def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> Non
     context = network.encode_context(observations, lights)
     whole = network(observations, lights)
     parts = [network(part, lights, context=context) for part in observations.split(7)]
-    torch.testing.assert_close(torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0)
-    torch.testing.assert_close(torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0
+    )
+    torch.testing.assert_close(
+        torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0
+    )
     # It does say something, and the order of the sample does not matter.
     other = network(observations, lights, context=network.encode_context(*pixels(20, 5)))
     assert (other.normals - whole.normals).abs().max() > 1e-3
@@ -184,11 +211,14 @@ def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
     for number, (seen, own) in enumerate(captures):
         maps = network.build_maps(seen, own)
         alone = network.estimate(maps, network.interpolate(maps))
-        # Processors with AMX round sums of other sizes of batches differently; another capture would change 0.01.
+        # Processors with AMX round sums of other sizes of batches differently; another capture
+        # would change 0.01.
         torch.testing.assert_close(together.normals[number::3], alone.normals, atol=3e-4, rtol=0)
 
 
-def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(network: SplineNet) -> None:
+def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(
+    network: SplineNet,
+) -> None:
     observations, lights = pixels(16)
     whole = network(observations, lights).normals
     torch.testing.assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
@@ -214,4 +244,6 @@ def test_attention_and_mean_are_those_of_the_formulas() -> None:
             weights = torch.softmax(keys[:, part] @ asked / 2, dim=0)
             heads.append(weights @ values[:, part])
         seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
-        torch.testing.assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5
+        )

@@ -1,4 +1,6 @@
-"""The whole network between observations and normals: shapes, limits, symmetries, and the error that it tells."""
+"""The whole network between observations and normals: shapes, limits, symmetries, and the error
+that it tells.
+"""
 
 import math
 
@@ -11,8 +13,17 @@ from torch import Tensor, nn
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.config import STARTING_FITS, NetworkConfig, fit_normals
-from splinecli.estimate.networks.li_ne_net import MapEncoder, error_negative_log_likelihood, probability_within
-from splinecli.estimate.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
+from splinecli.estimate.networks.li_ne_net import (
+    MapEncoder,
+    error_negative_log_likelihood,
+    probability_within,
+)
+from splinecli.estimate.networks.spline_net import (
+    Rotation,
+    SplineNet,
+    to_capture_frame,
+    to_pixel_frame,
+)
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from tiny_networks import TINY, random_network
@@ -23,7 +34,9 @@ FLIP = torch.tensor((1.0, -1.0, 1.0))
 
 @pytest.fixture(scope="module")
 def pixels() -> tuple[Tensor, Tensor]:
-    """64 generated pixels under ten shared lights, in float64 so that no rounding moves a light to another cell."""
+    """64 generated pixels under ten shared lights, in float64 so that no rounding moves a light to
+    another cell.
+    """
     config = PixelGeneratorConfig(min_lights=10, max_lights=10, light_direction_error_share=0.0)
     generator = torch.Generator().manual_seed(5)
     lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
@@ -36,16 +49,22 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels: tuple[Tensor, Tensor]) -> None:
+def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
+    pixels: tuple[Tensor, Tensor],
+) -> None:
     observations, lights = pixels
     network = SplineNet(NetworkConfig(**TINY)).double()
-    expected = torch.nn.functional.normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
+    expected = torch.nn.functional.normalize(
+        fit_lambertian(observations / map_scale(observations), lights), dim=1
+    )
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
     with torch.no_grad():
         normals = network(observations, lights).normals
         dense = network.interpolate(network.build_maps(observations, lights))
-    torch.testing.assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
+    torch.testing.assert_close(
+        normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False
+    )
     # Its dense map is that normal's Lambertian one, turned to azimuth 0.
     b = fit_lambertian(observations / map_scale(observations), lights)[visible]
     x, z = b[:, :2].norm(dim=1)[:, None, None], b[:, 2, None, None]
@@ -60,7 +79,9 @@ def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):
     observations, lights = pixels
     network = random_network(**settings).double()
     with torch.no_grad():
-        here, there = (network(observations, seen).normals for seen in (lights, turn(lights, degrees)))
+        here, there = (
+            network(observations, seen).normals for seen in (lights, turn(lights, degrees))
+        )
     torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
     # The correction is not nothing: without it the fit alone would pass.
     fit = fit_lambertian(observations / map_scale(observations), lights)
@@ -75,7 +96,9 @@ def test_observations_that_are_not_valid_do_not_matter(pixels, settings):
     garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
     with torch.no_grad():
         expected = network(observations[:, :7], lights[:7]).normals
-        torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0
+        )
 
 
 def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor, Tensor]) -> None:
@@ -94,10 +117,13 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor
 def test_frames_there_and_back(pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
     observations, lights = pixels
     network = random_network().double()
-    views = network.build_maps(observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror))
+    views = network.build_maps(
+        observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror)
+    )
     vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
     torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
-    # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or not.
+    # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or
+    # not.
     fit = fit_lambertian(observations / map_scale(observations), lights)
     tilted = fit[:, :2].norm(dim=1) > 0.01
     azimuth = torch.rad2deg(torch.atan2(*to_pixel_frame(fit, views)[:, [1, 0]].unbind(1)))
@@ -118,10 +144,14 @@ def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> 
 
 @pytest.mark.parametrize(("median_deg", "shape"), [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
 def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
-    error = torch.tensor([[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64)
+    error = torch.tensor(
+        [[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64
+    )
     expected = stats.fisk(shape, scale=median_deg)
     for limit_deg in (0.1, 5.0, 60.0):
-        assert probability_within(error, limit_deg).item() == pytest.approx(expected.cdf(limit_deg + 0.1))
+        assert probability_within(error, limit_deg).item() == pytest.approx(
+            expected.cdf(limit_deg + 0.1)
+        )
     angles_deg = np.array([0.3, 4.0, 50.0])
     # Of the angle's logarithm, a tenth of a degree added.
     found = error_negative_log_likelihood(error, torch.from_numpy(np.radians(angles_deg)))
@@ -162,7 +192,9 @@ NAMES = tuple(STARTING_FITS)
 
 
 def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each pixel."""
+    """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each
+    pixel.
+    """
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(count, lights, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0))
     directions = torch.nn.functional.normalize(directions, dim=-1)
@@ -174,7 +206,9 @@ def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_they_are_the_methods_of_these_names(name: str) -> None:
     observations, directions = draw_pixels(20, 12)
     shared = directions[0]
-    expected = make_estimator(name, MethodOptions(device="cpu")).estimate(observations.numpy(), shared.double().numpy())
+    expected = make_estimator(name, MethodOptions(device="cpu")).estimate(
+        observations.numpy(), shared.double().numpy()
+    )
     found = fit_normals([name], observations, shared)[:, 0]
     torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
 

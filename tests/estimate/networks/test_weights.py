@@ -27,7 +27,9 @@ def saved(tmp_path: Path) -> Path:
     return tmp_path / "tiny.safetensors"
 
 
-def write_like_splinecli(path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str) -> None:
+def write_like_splinecli(
+    path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str
+) -> None:
     metadata = {"format": FORMAT, "config": json.dumps(network.config.to_dict())}
     save_file(tensors, path, metadata | {"tensors_sha256": tensors_sha256(tensors)} | changes)
 
@@ -44,12 +46,19 @@ def test_round_trip(tmp_path: Path, settings: dict[str, object]) -> None:
     assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     for name, tensor in network.state_dict().items():
         # float16 keeps 11 bits.
-        torch.testing.assert_close(loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24)
-    lights = torch.nn.functional.normalize(torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1)
+        torch.testing.assert_close(
+            loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24
+        )
+    lights = torch.nn.functional.normalize(
+        torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1
+    )
     observations = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.testing.assert_close(
-            loaded.network(observations, lights).normals, network(observations, lights).normals, atol=5e-3, rtol=0
+            loaded.network(observations, lights).normals,
+            network(observations, lights).normals,
+            atol=5e-3,
+            rtol=0,
         )
 
 
@@ -76,7 +85,9 @@ def test_a_configuration_that_cannot_be(tmp_path: Path, config: str) -> None:
 
 
 class TensorsMade(TorchFunctionMode):
-    """Notes the elements of all tensors that functions of PyTorch return, but for those without memory."""
+    """Notes the elements of all tensors that functions of PyTorch return, but for those without
+    memory.
+    """
 
     made: tuple[int, ...] = ()
 
@@ -96,12 +107,17 @@ class TensorsMade(TorchFunctionMode):
         {"li_blocks": 65},
     ],
 )
-def test_a_configuration_far_larger_than_the_tensors(tmp_path: Path, settings: dict[str, int]) -> None:
+def test_a_configuration_far_larger_than_the_tensors(
+    tmp_path: Path, settings: dict[str, int]
+) -> None:
     """It is refused without making its tensors, which would take gigabytes."""
     network, path = random_network(), tmp_path / "a.safetensors"
     config = json.dumps({**network.config.to_dict(), **settings})
     write_like_splinecli(path, network, dict(network.state_dict()), config=config)
-    with TensorsMade() as tensors, pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"):
+    with (
+        TensorsMade() as tensors,
+        pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"),
+    ):
         load_weights(path)
     assert max(tensors.made, default=0) < 1_000_000
 
@@ -137,7 +153,10 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
             return Path.touch, (tmp_path / "exploded",)
 
     path = tmp_path / "weights.pth"
-    for write in (lambda: path.write_bytes(pickle.dumps(Bomb())), lambda: torch.save({"w": torch.zeros(3)}, path)):
+    for write in (
+        lambda: path.write_bytes(pickle.dumps(Bomb())),
+        lambda: torch.save({"w": torch.zeros(3)}, path),
+    ):
         write()
         with pytest.raises(ModelError, match="not a safetensors file"):
             resolve_weights(str(path))
@@ -149,7 +168,9 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
 def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "SHIPPED", saved.parent)
     entry = {"file": saved.name, "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
-    (saved.parent / "weights.json").write_text(json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}}))
+    (saved.parent / "weights.json").write_text(
+        json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}})
+    )
     assert resolve_weights("good").name == "good"
     assert resolve_weights(str(saved)).name == "tiny"
     with pytest.raises(ModelError, match="the shipped weights 'bad' were changed"):
@@ -171,7 +192,9 @@ def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     header = json.dumps({str(number): empty for number in range(30_000)}).encode()
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
-    with pytest.raises(ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"):
+    with pytest.raises(
+        ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"
+    ):
         load_weights(tmp_path / "a.safetensors")
 
 
@@ -196,7 +219,10 @@ def test_round_trip_of_a_configuration() -> None:
         ({"sees_capture": True}, "'sees_capture' needs 'set_width'"),
         ({"set_width": 20}, "'set_width' is 20; expected a multiple of 16"),
         ({"size": "paper", "set_width": 16}, "'set_width' needs the size 'compact'"),
-        ({"map_size": 30}, "'map_size' is 30; expected a whole number from 8 to 128, a multiple of 4"),
+        (
+            {"map_size": 30},
+            "'map_size' is 30; expected a whole number from 8 to 128, a multiple of 4",
+        ),
         ({"size": "paper", "error_head": True}, "'error_head' needs the size 'compact'"),
         ({"map_size": 4096}, "'map_size' is 4096"),
     ],

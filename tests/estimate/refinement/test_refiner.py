@@ -1,4 +1,6 @@
-"""Refinement of a whole capture: tiles, masks, dark pixels, scores of single pixels, and detail that is real."""
+"""Refinement of a whole capture: tiles, masks, dark pixels, scores of single pixels, and detail
+that is real.
+"""
 
 from pathlib import Path
 from typing import TypeVar
@@ -70,7 +72,9 @@ def refine(
 
 @pytest.mark.parametrize("shape", [(2 * REACH + 70, 40), (40, 2 * REACH + 70)])
 def test_tiles_change_nothing(shape: tuple[int, int]) -> None:
-    """Three tiles in a row or in a column. Seams of tiles on all sides: test_shipped_refinement.py."""
+    """Three tiles in a row or in a column. Seams of tiles on all sides:
+    test_shipped_refinement.py.
+    """
     mask = np.random.default_rng(0).random(shape) < 0.95
     mask[30:60, 10:30] = False
     _, normals, errors = refine(mask, 512)
@@ -108,26 +112,35 @@ def test_a_turned_capture_gets_turned_normals() -> None:
         found = (np.rot90(normals, turns)[seen] @ turn.T).astype(np.float32)
         observations = (found @ lights.T).clip(0).astype(np.float32)
         errors = np.tile(np.float32((-3, 1)), (len(found), 1))
-        NetworkRefiner(net, "float32").refine(seen, observations, distant(observations, lights), found, errors)
+        NetworkRefiner(net, "float32").refine(
+            seen, observations, distant(observations, lights), found, errors
+        )
         result = np.zeros((*seen.shape, 3), np.float32)
         result[seen] = found @ turn
         return np.rot90(result, -turns)
 
-    # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them in this test.
+    # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them
+    # in this test.
     np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:
     network = lively(SplineNet(NetworkConfig(**TINY, error_head=True, refines=True)))
     name = "spline-net" if refines else "spline-net-pixelwise"
-    return NetworkEstimator(name, LoadedNetwork(network, "tiny", "0"), precision="float32", refines=refines)
+    return NetworkEstimator(
+        name, LoadedNetwork(network, "tiny", "0"), precision="float32", refines=refines
+    )
 
 
 def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
     rng = np.random.default_rng(2)
     mask = np.ones((7, 8), np.bool_)
-    capture = Capture("c", rng.uniform(0.1, 1, (56, 6)).astype(np.float32), LIGHTS, tuple(range(6)), mask)
-    pixelwise, refined = (estimate_normals(capture, estimator(refines=refines)) for refines in (False, True))
+    capture = Capture(
+        "c", rng.uniform(0.1, 1, (56, 6)).astype(np.float32), LIGHTS, tuple(range(6)), mask
+    )
+    pixelwise, refined = (
+        estimate_normals(capture, estimator(refines=refines)) for refines in (False, True)
+    )
     alone = estimator(refines=True).estimate(capture.observations, LIGHTS)
     np.testing.assert_array_equal(pixelwise.normal_map[mask], alone)
     assert np.abs(refined.normal_map - pixelwise.normal_map).max() > 1e-3
@@ -136,7 +149,9 @@ def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
 
 @pytest.mark.parametrize("of_package", [False, True])
 def test_scored_pixels_are_estimated_among_all(of_package: bool) -> None:
-    """Refinement and context need the whole capture: 50 pixels score as they do in the map of `infer`."""
+    """Refinement and context need the whole capture: 50 pixels score as they do in the map of
+    `infer`.
+    """
     folder = Path(__file__).parents[3] / "examples/medallion"
     method = make_estimator("spline-net-pixelwise") if of_package else estimator(refines=True)
     protocol = Protocol(n_lights=None, trials=1, max_pixels=50)
@@ -149,7 +164,9 @@ def test_scored_pixels_are_estimated_among_all(of_package: bool) -> None:
 
 SIDE = 48
 FEW_LIGHTS = torch.tensor(spiral_lights(10, 55), dtype=torch.float32)
-SQUARE = torch.tensor(directions_at(np.radians(90 * np.arange(4)), np.radians(40)), dtype=torch.float32)
+SQUARE = torch.tensor(
+    directions_at(np.radians(90 * np.arange(4)), np.radians(40)), dtype=torch.float32
+)
 FLAT = torch.tensor((0.0, 0.0, 1.0))[:, None, None].repeat(1, SIDE, SIDE)
 EVERYWHERE = torch.ones(1, SIDE, SIDE)
 
@@ -158,8 +175,12 @@ GROOVES = normalize(torch.stack((-SLOPE, torch.zeros_like(SLOPE), torch.ones_lik
 """True normals of grooves of one pixel."""
 
 
-def photographed(truth: Tensor, noise: float, lights: Tensor = FEW_LIGHTS, *, seen: Tensor | None = None) -> Tensor:
-    """Features (CHANNELS, SIDE, SIDE) of a matte surface, where SPLINE-Net has seen the normals `seen` (the truth)."""
+def photographed(
+    truth: Tensor, noise: float, lights: Tensor = FEW_LIGHTS, *, seen: Tensor | None = None
+) -> Tensor:
+    """Features (CHANNELS, SIDE, SIDE) of a matte surface, where SPLINE-Net has seen the normals
+    `seen` (the truth).
+    """
     generator = torch.Generator().manual_seed(4)
     errors = noise * torch.randn(SIDE**2, len(lights), generator=generator)
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
@@ -180,14 +201,23 @@ def photographed_with_noise(truth: Tensor, noise: float, lights: Tensor = FEW_LI
 def restored(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
     """What restore_detail makes of refined normals and features."""
     normals = features[channels("normal")]
-    return restore_detail(refined, normals, normals + features[channels("plain")], features[channels("noise")], mask)
+    return restore_detail(
+        refined, normals, normals + features[channels("plain")], features[channels("noise")], mask
+    )
 
 
-@pytest.mark.parametrize(("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)])
-def test_grooves_come_back_where_they_exceed_the_noise(noise: float, least: float, most: float) -> None:
-    """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no detail."""
+@pytest.mark.parametrize(
+    ("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)]
+)
+def test_grooves_come_back_where_they_exceed_the_noise(
+    noise: float, least: float, most: float
+) -> None:
+    """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no
+    detail.
+    """
     found = restored(FLAT, photographed(GROOVES, noise), EVERYWHERE)
-    middle = slice(DETAIL_REACH, -DETAIL_REACH)  # near the border, the mean around a pixel has more of one side
+    # near the border, the mean around a pixel has more of one side
+    middle = slice(DETAIL_REACH, -DETAIL_REACH)
     assert least < float((found[0] / GROOVES[0])[:, middle].mean()) < most
 
 
@@ -202,7 +232,9 @@ def test_nothing_comes_back_that_least_squares_does_not_show() -> None:
 def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     """Also beside a crease, which is detail that is not missing."""
     slope = torch.where(torch.arange(SIDE) < SIDE // 2, 0.4, -0.4).expand(SIDE, SIDE)
-    crease = normalize(torch.stack((-slope, torch.zeros_like(slope), torch.ones_like(slope))), dim=0)
+    crease = normalize(
+        torch.stack((-slope, torch.zeros_like(slope), torch.ones_like(slope))), dim=0
+    )
     truth = crease if creased else FLAT
     noisy = photographed_with_noise(truth, 0.03, lights)
     found = restored(truth, noisy, EVERYWHERE)

@@ -1,4 +1,6 @@
-"""The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
+"""The shipped refinement net invents nothing: analytic scenes whose normals are known
+everywhere.
+"""
 
 from typing import Any
 
@@ -32,18 +34,26 @@ def scene(
     gloss: float = 0.0,
     unmeasured: NDArray[np.floating] | float = 1.0,
 ) -> Capture:
-    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale.
+    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full
+    scale.
 
     The lamps are `unmeasured` times as strong as the capture says.
     """
     rng = np.random.default_rng(0)
     flat = normals.reshape(-1, 3)
-    observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
+    observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (
+        flat @ LIGHTS.T
+    ).clip(0)
     observations = unmeasured * (observations + gloss * (flat @ halfway(LIGHTS).T).clip(0) ** 60)
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
     return Capture(
-        "scene", observations.clip(0).astype(np.float32), LIGHTS, tuple(range(10)), mask, normals.astype(np.float32)
+        "scene",
+        observations.clip(0).astype(np.float32),
+        LIGHTS,
+        tuple(range(10)),
+        mask,
+        normals.astype(np.float32),
     )
 
 
@@ -58,7 +68,9 @@ def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, Norma
     capture = scene(*surface, **faults)
     estimator = make_estimator("spline-net")
     estimator.refiner.most_pixels = capture.n_pixels - HALVED  # type: ignore[attr-defined]
-    return estimate_normals(capture, estimator), estimate_normals(capture, make_estimator("spline-net-pixelwise"))
+    return estimate_normals(capture, estimator), estimate_normals(
+        capture, make_estimator("spline-net-pixelwise")
+    )
 
 
 def mean_error_deg(estimate: NormalEstimate) -> float:
@@ -79,10 +91,14 @@ def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss: float) -> N
 
     def step_deg(estimate: NormalEstimate) -> float:
         """The angle between the mean normals of the dark and of the bright squares."""
-        dark_mean, bright_mean = (unit(estimate.normal_map[part].mean(axis=0)) for part in (~bright, bright))
+        dark_mean, bright_mean = (
+            unit(estimate.normal_map[part].mean(axis=0)) for part in (~bright, bright)
+        )
         return float(angle_between_deg(dark_mean, bright_mean))
 
-    refined, pixelwise = refined_and_not(PLATE, np.where(bright, 0.8, 0.2), noise=0.005, gloss=gloss)
+    refined, pixelwise = refined_and_not(
+        PLATE, np.where(bright, 0.8, 0.2), noise=0.005, gloss=gloss
+    )
     assert step_deg(refined) < step_deg(pixelwise) + 0.1
 
 
@@ -107,7 +123,9 @@ def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
 
 @pytest.mark.parametrize(("width", "noise"), [(1, 0.02), (2, 0.002)])
 def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -> None:
-    """They turn normals by many degrees, which says nothing about detail. The net alone takes most of it for noise."""
+    """They turn normals by many degrees, which says nothing about detail. The net alone takes most
+    of it for noise.
+    """
     normals, slope = grooves(width)
     stronger = 1 + 0.5 * (LIGHTS[:, 0] > 0)
     refined, pixelwise = refined_and_not(normals, 0.5, noise=noise, unmeasured=stronger)
@@ -117,8 +135,11 @@ def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -
 
 @pytest.mark.parametrize("behind", [0.002, 0.3])
 def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
-    """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the sphere."""
-    size = 2 * SIZE  # halved, the two pixels at the rim of a smaller sphere would be too large a share
+    """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the
+    sphere.
+    """
+    # halved, the two pixels at the rim of a smaller sphere would be too large a share
+    size = 2 * SIZE
     rows, columns = np.mgrid[:size, :size]
     x, y = (columns - size / 2 + 0.5) / 36, (size / 2 - 0.5 - rows) / 36
     height = np.sqrt((1 - x**2 - y**2).clip(0))
@@ -132,7 +153,9 @@ def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
 
 
 def test_seams_of_tiles_do_not_show() -> None:
-    """The margin of a tile is smaller than what the nets can see. Its share of a normal is far below its error."""
+    """The margin of a tile is smaller than what the nets can see. Its share of a normal is far
+    below its error.
+    """
     rows, columns = np.mgrid[:SEAMS, :SEAMS]
     slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
     normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))

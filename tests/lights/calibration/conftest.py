@@ -1,4 +1,6 @@
-"""Photographs of made-up mirror balls: the oracle is the law of reflection, followed from the camera to the lamp."""
+"""Photographs of made-up mirror balls: the oracle is the law of reflection, followed from the
+camera to the lamp.
+"""
 
 from collections.abc import Callable
 
@@ -14,15 +16,22 @@ Render = Callable[..., NDArray[np.float32]]
 
 @pytest.fixture
 def render_ball() -> Render:
-    """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim room around it.
+    """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim
+    room around it.
 
     The lamp is in a direction, or at a position in pixels from the middle of the image.
     """
 
     def render(
-        light: NDArray[np.float64], x: float = 103.3, y: float = 88.7, radius: float = 61.4,
-        shape: tuple[int, int] = (180, 210), lamp: float = 30.0, *, near: bool = False,
-    ) -> NDArray[np.float32]:  # fmt: skip
+        light: NDArray[np.float64],
+        x: float = 103.3,
+        y: float = 88.7,
+        radius: float = 61.4,
+        shape: tuple[int, int] = (180, 210),
+        lamp: float = 30.0,
+        *,
+        near: bool = False,
+    ) -> NDArray[np.float32]:
         height, width = shape
         offsets = (np.arange(3) - 1) / 3
         rows = (np.arange(height)[:, None] + offsets).ravel()

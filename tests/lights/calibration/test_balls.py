@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration.conftest import Render
 from numpy.typing import NDArray
 
+from lights.calibration.conftest import Render
 from scenes import decode_rgb
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
@@ -34,7 +34,9 @@ def ball(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> Pa
 
 
 @pytest.mark.parametrize("outline", ["--circle", "mask", "picture", "reference"])
-def test_lights_of_a_ball(ball: Path, render_ball: Render, lights: NDArray[np.float64], outline: str) -> None:
+def test_lights_of_a_ball(
+    ball: Path, render_ball: Render, lights: NDArray[np.float64], outline: str
+) -> None:
     if outline == "mask":
         write(ball, "mask.png", BALL.inside((180, 210)).astype(np.float64))
     if outline == "reference":
@@ -74,16 +76,23 @@ def test_several_balls_are_averaged(ball, tmp_path, render_ball, lights):
 def test_pictures_of_another_size(ball: Path) -> None:
     write(ball, "3.png", np.zeros((50, 60)))
     for circle in (BALL, None):
-        with pytest.raises(InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):
+        with pytest.raises(
+            InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"
+        ):
             calibrate_ball(find_ball_files(ball), circle=circle)
 
 
 def test_real_balls(shared_data: Path) -> None:
     chrome = calibrate_ball(find_ball_files(shared_data / "uw/chrome"))
-    off = angle_between_deg(chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt"))
+    off = angle_between_deg(
+        chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt")
+    )
     assert off.mean() < 0.6
     assert off.max() < 1
-    probes = [calibrate_ball(find_ball_files(shared_data / f"psbox/LightProbe-{number}")) for number in (1, 2)]
+    probes = [
+        calibrate_ball(find_ball_files(shared_data / f"psbox/LightProbe-{number}"))
+        for number in (1, 2)
+    ]
     expected = read_light_directions(shared_data / "psbox/light_directions.txt")
     for probe in probes:
         assert angle_between_deg(probe.directions, expected).mean() < 2

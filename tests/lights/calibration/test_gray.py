@@ -20,7 +20,9 @@ LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, -0.48, np.sqrt(1 - 0.
 
 
 def write(folder: Path, images: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> Path:
-    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), None, mask=mask, names="{}.png")
+    return write_capture(
+        folder, np.rint(images * 65535).astype(np.uint16), None, mask=mask, names="{}.png"
+    )
 
 
 def ball_images() -> NDArray[np.float64]:
@@ -33,7 +35,9 @@ def ball_images() -> NDArray[np.float64]:
 @pytest.mark.parametrize("target", ["card", "ball"])
 @pytest.mark.parametrize("brightest", [1.25, 3.0])
 def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest: float) -> None:
-    """One lamp is clipped at 4095, for a share of the target or for all of a card, and no tag says so."""
+    """One lamp is clipped at 4095, for a share of the target or for all of a card, and no tag says
+    so.
+    """
     lights = np.tile((0.0, 0.0, 1.0), (4, 1))
     intensities = np.array((1.0, 1.0, 1.0, brightest))
     y, x = np.indices((84, 80)).astype(np.float64)
@@ -41,7 +45,9 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
     generator = np.random.default_rng(0)
     light = 0.78 * cosine * intensities[:, None, None] * generator.normal(1, 0.01, (4, 84, 80))
     mask = BALL.inside((84, 80)) if target == "ball" else None
-    folder = write(tmp_path / "gray", np.rint(4095 * light.clip(0, 1))[..., None].repeat(3, 3) / 65535, mask)
+    folder = write(
+        tmp_path / "gray", np.rint(4095 * light.clip(0, 1))[..., None].repeat(3, 3) / 65535, mask
+    )
     if (target, brightest) == ("card", 3.0):
         with pytest.raises(InputError, match=r"3\.png: the target is dark or overexposed"):
             measure_light_intensities(find_ball_files(folder), lights, target)
@@ -56,11 +62,16 @@ def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Pa
     with pytest.raises(InputError, match="images of the gray ball need a mask"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
     cv2.imwrite(str(folder / "1.png"), np.full((20, 31), 30_000, np.uint16))
-    with pytest.raises(InputError, match=r"1\.png: found an image of 31 x 20 pixels, expected 30 x 20 as in 0\.png"):
+    with pytest.raises(
+        InputError, match=r"1\.png: found an image of 31 x 20 pixels, expected 30 x 20 as in 0\.png"
+    ):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
     cv2.imwrite(str(folder / "1.png"), np.full((20, 30), 30_000, np.uint16))
     cv2.imwrite(str(folder / "mask.png"), np.full((10, 30), 255, np.uint8))
-    with pytest.raises(InputError, match=r"mask\.png: found a mask of 30 x 10 pixels, expected 30 x 20 as in 0\.png"):
+    with pytest.raises(
+        InputError,
+        match=r"mask\.png: found a mask of 30 x 10 pixels, expected 30 x 20 as in 0\.png",
+    ):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
 
 
@@ -81,5 +92,7 @@ def test_a_card(tmp_path: Path, gamma: float, ambient: float) -> None:
         stored = np.full((20, 30, 3), round(ambient * 65535), np.uint16)
         cv2.imwrite(str(folder / "ambient.png"), stored)
     radiometry = RadiometricCalibration(gamma)
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card", radiometry=radiometry)
+    found = measure_light_intensities(
+        find_ball_files(folder), LIGHTS, "card", radiometry=radiometry
+    )
     np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)

@@ -1,6 +1,7 @@
 """Positions of lamps from mirror balls, and the report of a calibration.
 
-The oracles are the law of reflection under a lamp of known position, and lights whose errors are known.
+The oracles are the law of reflection under a lamp of known position, and lights whose errors are
+known.
 """
 
 import json
@@ -9,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration.conftest import Render
 from numpy.typing import NDArray
 
+from lights.calibration.conftest import Render
 from scenes import directions_at, spiral_lights
 from splinecli.lights.calibration.balls import (
     DISTANT,
@@ -25,7 +26,12 @@ from splinecli.lights.calibration.balls import (
     find_ball_files,
 )
 from splinecli.lights.calibration.circle import Circle
-from splinecli.lights.calibration.lamps import calibration_report, intersect_rays, summary_lines, triangulate_lamps
+from splinecli.lights.calibration.lamps import (
+    calibration_report,
+    intersect_rays,
+    summary_lines,
+    triangulate_lamps,
+)
 from splinecli.maths.normals import unit
 
 SHAPE = 160, 400
@@ -48,7 +54,10 @@ def calibrate(
         (folder / name).mkdir(parents=True)
         for number, lamp in enumerate(positions):
             picture = render_ball(lamp, circle.x, circle.y, circle.radius, SHAPE, near=True)
-            cv2.imwrite(str(folder / name / f"{number}.png"), np.rint(picture.clip(0, 1) * 255).astype(np.uint8))
+            cv2.imwrite(
+                str(folder / name / f"{number}.png"),
+                np.rint(picture.clip(0, 1) * 255).astype(np.uint8),
+            )
         files = find_ball_files(folder / name)
         balls.append(calibrate_ball(files, circle=circle, camera_matrix=matrix if known else None))
     return balls
@@ -69,10 +78,11 @@ PIXELS = (2000, 3000)
 def photographed(
     rng: np.random.Generator, camera: float, source: str, *, height: float = 0.0
 ) -> tuple[NDArray[np.float64], list[BallCalibration]]:
-    """Lamps (6, 3), and two balls of 40 mm as a pinhole camera sees them, 80 mm being the width of the object.
+    """Lamps (6, 3), and two balls of 40 mm as a pinhole camera sees them, 80 mm being the width of
+    the object.
 
-    The highlight is where the normal halves the angle between camera and lamp, found by iteration. Outlines are the
-    points at which lines of sight touch the ball. Pixels have errors of 0.3.
+    The highlight is where the normal halves the angle between camera and lamp, found by iteration.
+    Outlines are the points at which lines of sight touch the ball. Pixels have errors of 0.3.
 
     Args:
         camera: its distance in widths.
@@ -90,7 +100,9 @@ def photographed(
     zenith, azimuth = np.radians(rng.uniform(15, 50, 6)), rng.uniform(0, 2 * np.pi, 6)
     towards = directions_at(azimuth, zenith)
     places = towards * rng.uniform(300, 700, (6, 1)) * min(1, eye[2] / 900)
-    assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(source, focal)
+    assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(
+        source, focal
+    )
     matrix = np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1)))
     view = View(matrix, source, SHORTEST_LENS * PIXELS[1])
     balls = []
@@ -105,20 +117,26 @@ def photographed(
         across = np.linalg.svd((eye - centre)[None])[2][1:]
         angle = np.arange(360)[:, None] * np.pi / 180
         rim = np.cos(angle) * across[0] + np.sin(angle) * across[1]
-        outline = image_of(centre + 400 / away * (eye - centre) / away + 20 * np.sqrt(1 - (20 / away) ** 2) * rim)
+        outline = image_of(
+            centre + 400 / away * (eye - centre) / away + 20 * np.sqrt(1 - (20 / away) ** 2) * rim
+        )
         x, y = outline.mean(axis=0)
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
         marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())
         files = BallFiles(Path("ball"), (), None, None)
-        balls.append(BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS))
+        balls.append(
+            BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS)
+        )
     return places, balls
 
 
 @pytest.mark.parametrize("source", ["--camera-matrix", "EXIF", "assumed distant"])
 def test_the_uncertainty_covers_the_error(source: str) -> None:
-    """Cameras at 5 to 100 widths of the object: 9 of 10 errors or more are within the stated uncertainty."""
+    """Cameras at 5 to 100 widths of the object: 9 of 10 errors or more are within the stated
+    uncertainty.
+    """
     rng = np.random.default_rng(0)
     covered, errors = [], []
     for camera in (5, 10, 25, 50, 100):
@@ -145,10 +163,13 @@ def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
     assert found is not None and found.known
     assert found.pixel_size == pytest.approx(40 / 120)
     errors = np.linalg.norm(found.positions * 3 - lamps(1200.0), axis=1)
-    # A highlight is found within 0.2 pixels or so: 0.4 degrees, and at this distance 60 pixels along the rays.
+    # A highlight is found within 0.2 pixels or so: 0.4 degrees, and at this distance 60 pixels
+    # along the rays.
     assert errors.mean() < 75
     assert (errors < 3 * found.uncertainty).all()
-    report = calibration_report(combine_balls(balls), None, None, picture="calibration.png", lamps=found)
+    report = calibration_report(
+        combine_balls(balls), None, None, picture="calibration.png", lamps=found
+    )
     # The balls see the lamps in directions up to 9 degrees apart, which is no disagreement.
     assert report["disagreement_deg"]["largest"] > 3
     assert report["warnings"] == []
@@ -161,9 +182,15 @@ def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: boo
     balls = calibrate(tmp_path, render_ball, lamps(1e6 if known else 1500.0), known=known)
     found = triangulate_lamps(balls)
     assert found is not None and not found.known
-    report = calibration_report(combine_balls(balls), None, None, picture="calibration.png", lamps=found)
-    assert summary_lines(report)[-1] == "the lamps' distances are unknown: they are treated as distant"
-    expected = "put the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
+    report = calibration_report(
+        combine_balls(balls), None, None, picture="calibration.png", lamps=found
+    )
+    assert (
+        summary_lines(report)[-1] == "the lamps' distances are unknown: they are treated as distant"
+    )
+    expected = (
+        "put the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
+    )
     assert any(expected in warning for warning in report["warnings"])
     assert triangulate_lamps(balls[:1]) is None
 
@@ -179,7 +206,9 @@ def ball(directions: NDArray[np.float64]) -> BallCalibration:
     highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
     normals = unit(directions + np.array((0, 0, 1)))
     view = View(np.eye(3), "assumed distant", 1.0)
-    return BallCalibration(files, Circle(50, 40, 30), "--circle", highlights, directions, normals, view, (100, 100))
+    return BallCalibration(
+        files, Circle(50, 40, 30), "--circle", highlights, directions, normals, view, (100, 100)
+    )
 
 
 def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = None) -> dict:
@@ -188,7 +217,9 @@ def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = Non
 
 @pytest.fixture
 def directions() -> NDArray[np.float64]:
-    """Four lights (4, 3) in the plane x, z, so that all turn alike about the x axis where x is zero."""
+    """Four lights (4, 3) in the plane x, z, so that all turn alike about the x axis where x is
+    zero.
+    """
     return unit(np.array([(0.0, 0.0, 1.0)] * 4))
 
 
@@ -200,17 +231,21 @@ def test_one_ball(directions: NDArray[np.float64]) -> None:
     assert found["warnings"] == []
     assert found["balls"][0]["highlights"][0] == [1.235, 2.0]
     assert summary_lines(found) == [
-        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible, spread 0.0 pixels)"
+        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible,"
+        " spread 0.0 pixels)"
     ]
 
 
 @pytest.mark.parametrize(("degrees", "warned"), [(9.8, False), (10.2, True)])
 def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, warned: bool) -> None:
-    # The mean of two directions lies half-way, so each differs from it by half the angle; the limit is 5 degrees.
+    # The mean of two directions lies half-way, so each differs from it by half the angle; the limit
+    # is 5 degrees.
     found = report([ball(directions), ball(turned(directions, degrees))])
     assert found["disagreement_deg"] == {"mean": degrees / 2, "largest": degrees / 2}
     assert bool(found["warnings"]) == warned
-    assert f"the balls differ from their mean by {degrees / 2:.1f} degrees" in summary_lines(found)[-1]
+    assert (
+        f"the balls differ from their mean by {degrees / 2:.1f} degrees" in summary_lines(found)[-1]
+    )
 
 
 def test_a_compared_file(directions: NDArray[np.float64]) -> None:
@@ -221,6 +256,9 @@ def test_a_compared_file(directions: NDArray[np.float64]) -> None:
     # The normal at the highlight halves the angle of 40 degrees.
     found = report([ball(lights)], turned(directions, 20))
     assert found["compared"] == {"mean_deg": 20.0, "largest_deg": 20.0}
-    assert "the normals of the ball at the highlights instead of the light directions" in found["warnings"][0]
+    assert (
+        "the normals of the ball at the highlights instead of the light directions"
+        in found["warnings"][0]
+    )
     # Directions that are wrong in another way are not mistaken for normals.
     assert report([ball(lights)], turned(lights, 20))["warnings"] == []

@@ -5,11 +5,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from calibration.conftest import Render
 from numpy.typing import NDArray
 
+from lights.calibration.conftest import Render
 from splinecli.errors import InputError
-from splinecli.lights.calibration.balls import ball_centre, calibrate_ball, find_ball_files, find_highlight, reflect
+from splinecli.lights.calibration.balls import (
+    ball_centre,
+    calibrate_ball,
+    find_ball_files,
+    find_highlight,
+    reflect,
+)
 from splinecli.lights.calibration.circle import Circle
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -18,18 +24,27 @@ DISTANT = np.array(((1e6, 0, 104.5), (0, 1e6, 89.5), (0, 0, 1)))
 
 
 @pytest.mark.parametrize("full_scale", [None, 1.0])
-def test_directions_come_back(render_ball: Render, lights: NDArray[np.float64], full_scale: float | None) -> None:
+def test_directions_come_back(
+    render_ball: Render, lights: NDArray[np.float64], full_scale: float | None
+) -> None:
     for light in lights:
         picture = render_ball(light)
         picture = picture if full_scale is None else picture.clip(0, full_scale)
         highlight = find_highlight(picture, BALL, full_scale=full_scale)
         # A pixel of this ball is 1.9 degrees of light near its middle, and more towards its rim.
         place = np.array([(highlight.x, highlight.y)])
-        assert angle_between_deg(reflect(ball_centre(BALL.outline, DISTANT), place, DISTANT)[1][0], light) < 0.7
+        assert (
+            angle_between_deg(
+                reflect(ball_centre(BALL.outline, DISTANT), place, DISTANT)[1][0], light
+            )
+            < 0.7
+        )
         assert (highlight.saturated > 0.1) == (full_scale is not None)
 
 
-def test_sparkles_and_windows_are_no_lamps(render_ball: Render, lights: NDArray[np.float64]) -> None:
+def test_sparkles_and_windows_are_no_lamps(
+    render_ball: Render, lights: NDArray[np.float64]
+) -> None:
     picture = render_ball(lights[3]).clip(0, 1)
     expected = find_highlight(picture, BALL)
     picture[110, 80] = 1.0
@@ -38,7 +53,10 @@ def test_sparkles_and_windows_are_no_lamps(render_ball: Render, lights: NDArray[
     picture[60:110, 70:130] = 20
     with pytest.raises(InputError, match="too wide for a lamp"):
         find_highlight(picture, BALL)
-    for picture in (render_ball(np.array([0.0, 0.6, -0.8]), lamp=0.03), np.zeros((180, 210), np.float32)):
+    for picture in (
+        render_ball(np.array([0.0, 0.6, -0.8]), lamp=0.03),
+        np.zeros((180, 210), np.float32),
+    ):
         with pytest.raises(InputError, match="found no highlight"):
             find_highlight(picture, BALL)
 
@@ -53,7 +71,9 @@ def test_highlights_near_the_rim(tmp_path: Path, render_ball: Render) -> None:
 @pytest.mark.parametrize("distance", [6.0, 50.0, 9e3])
 @pytest.mark.parametrize("side", [0.0, 0.3])
 def test_the_centre_of_a_ball_seen_from_near(distance: float, side: float) -> None:
-    """Points of a sphere of radius 1 at which the line of sight touches it, seen by a pinhole camera."""
+    """Points of a sphere of radius 1 at which the line of sight touches it, seen by a pinhole
+    camera.
+    """
     centre = distance * np.array((side, -0.1, -1.0)) / np.hypot(np.hypot(side, 0.1), 1)
     focal = 100 * distance
     matrix = np.array(((focal, 0, 400), (0, focal, 300), (0, 0, 1.0)))

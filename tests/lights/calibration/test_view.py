@@ -33,7 +33,9 @@ def photograph(path: Path, tags: dict[int, object]) -> Path:
 def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) -> None:
     view = find_view(read_header(photograph(tmp_path / "a.jpg", tags)), None)
     assert view.source == ("assumed distant" if focal == DISTANT else "EXIF")
-    np.testing.assert_allclose(view.matrix, ((focal, 0, 179.5), (0, focal, 119.5), (0, 0, 1)), rtol=1e-6)
+    np.testing.assert_allclose(
+        view.matrix, ((focal, 0, 179.5), (0, focal, 119.5), (0, 0, 1)), rtol=1e-6
+    )
 
 
 def test_a_file_comes_first(tmp_path: Path) -> None:

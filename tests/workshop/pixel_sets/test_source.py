@@ -1,4 +1,6 @@
-"""Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only gaps."""
+"""Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only
+gaps.
+"""
 
 from dataclasses import replace
 
@@ -9,18 +11,31 @@ import torch
 from distributions import generator as seeded
 from small_pixel_sets import MakeSet
 from splinecli.maths.observation_map import cell_directions
-from splinecli.workshop.pixel_sets.source import FILL_ROUNDS, PixelSetSource, SampledPixels, fill_gaps
+from splinecli.workshop.pixel_sets.source import (
+    FILL_ROUNDS,
+    PixelSetSource,
+    SampledPixels,
+    fill_gaps,
+)
 from splinecli.workshop.pixel_sets.store import PixelSet
 from splinecli.workshop.synthesis.batches import CaptureConfig
 
 FAULTLESS = CaptureConfig(
-    min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
-    light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
+    min_lights=5,
+    max_lights=10,
+    usual_lights=8,
+    light_direction_error_share=0.0,
+    light_intensity_error_share=0.0,
+    saturated_share=0.0,
+    sensor_noise=False,
+    eight_bit_share=0.0,
     ambient_share=0.0,
-)  # fmt: skip
+)
 
 
-def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:
+def source_of(
+    pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0
+) -> PixelSetSource:
     return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
 
 
@@ -30,14 +45,20 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
     batch = source_of(pixel_set).draw(200)
     stored = {entry.name: pixel_set.load(entry) for entry in pixel_set.entries}
     seen = set()
-    rows = {normal.tobytes(): (name, row) for name in stored for row, normal in enumerate(stored[name].normals)}
+    rows = {
+        normal.tobytes(): (name, row)
+        for name in stored
+        for row, normal in enumerate(stored[name].normals)
+    }
     for pixel, normal in enumerate(batch.truth.normals.numpy()):
         name, row = rows[normal.tobytes()]
         seen.add(name)
         valid = batch.valid[pixel].numpy()
         used = set()
         for direction, observed in zip(
-            batch.light_directions[pixel].numpy()[valid], batch.observations[pixel].numpy()[valid], strict=True
+            batch.light_directions[pixel].numpy()[valid],
+            batch.observations[pixel].numpy()[valid],
+            strict=True,
         ):
             distance = np.abs(stored[name].light_directions - direction).max(axis=1)
             light = int(distance.argmin())
@@ -54,7 +75,8 @@ def test_all_pixels_have_the_same_probability(make_set: MakeSet) -> None:
     pixel_set = make_set()
     normals = source_of(pixel_set).draw(9000).truth.normals.numpy()
     of_b = (normals[:, None] == pixel_set.load(pixel_set.entries[1]).normals).all(axis=2)
-    # 30 pixels of 90: a third, and a ninetieth each. Within four standard deviations of the binomial.
+    # 30 pixels of 90: a third, and a ninetieth each. Within four standard deviations of the
+    # binomial.
     assert of_b.any(axis=1).sum() == pytest.approx(3000, abs=4 * np.sqrt(9000 * 2 / 9))
     assert of_b.sum(axis=0) == pytest.approx(np.full(30, 100), abs=4 * np.sqrt(100))
 
@@ -72,7 +94,11 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
 def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set: MakeSet) -> None:
     pixel_set = make_set()
     source = source_of(pixel_set, replace(FAULTLESS, capture_pixels=10))
-    names = {n.tobytes(): entry.name for entry in pixel_set.entries for n in pixel_set.load(entry).normals}
+    names = {
+        n.tobytes(): entry.name
+        for entry in pixel_set.entries
+        for n in pixel_set.load(entry).normals
+    }
     entries = []
     for _ in range(40):
         batch = source.draw(100)
@@ -84,7 +110,11 @@ def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set: Ma
             assert len(batch.light_directions[rows].unique(dim=0)) == 1
             assert len(batch.valid[rows].unique(dim=0)) == 1
         radiance = batch.observations / batch.exposure
-        stored = {v for e in pixel_set.entries for v in pixel_set.load(e).observations.round(4).ravel().tolist()}
+        stored = {
+            v
+            for e in pixel_set.entries
+            for v in pixel_set.load(e).observations.round(4).ravel().tolist()
+        }
         unclipped = (batch.observations < 0.99) & batch.valid
         assert {round(v, 4) for v in radiance[unclipped].tolist()} <= {round(v, 4) for v in stored}
     # An entry has as much weight as its pixels: 40, 30 and 20.
@@ -115,8 +145,8 @@ def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) ->
     torch.testing.assert_close(turned.normals, rotated)
     analytic = (cell_directions()[0] @ rotated.T).permute(2, 0, 1)[:, None].clamp(min=0)
     torch.testing.assert_close(dense.values * dense.known, analytic * dense.known)
-    # Interpolated between cells of 1 / 16, where n . l has a slope of about 1; along the rim, where l_z falls
-    # steeply and all neighbours lie further in, errors are larger.
+    # Interpolated between cells of 1 / 16, where n . l has a slope of about 1; along the rim, where
+    # l_z falls steeply and all neighbours lie further in, errors are larger.
     filled = dense.filled - dense.known
     error = ((dense.values - analytic) * filled).abs()
     assert error.sum() / filled.sum() < 0.02

@@ -13,7 +13,13 @@ from kills import content, killed_at
 from small_pixel_sets import MakeSet, matte_pixels
 from splinecli.errors import InputError, OutputError
 from splinecli.system.publishing import held_folder
-from splinecli.workshop.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSetWriter, open_pixel_set
+from splinecli.workshop.pixel_sets.store import (
+    ARRAYS,
+    FORMAT,
+    MANIFEST,
+    PixelSetWriter,
+    open_pixel_set,
+)
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 
@@ -26,7 +32,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def test_round_trip(tmp_path: Path, dtype: type) -> None:
     folder = tmp_path / "new" / "set"
     writer = PixelSetWriter(folder)
-    written = {name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")}
+    written = {
+        name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")
+    }
     for name, pixels in written.items():
         writer.add(name, f"scene {name}", "a test", RECIPE, pixels)
         assert name in writer
@@ -122,10 +130,15 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     ("manifest", "message"),
     [
         ({"name": "an app"}, "not the manifest of a pixel set: found format None"),
-        ({"format": FORMAT, "recipe": RECIPE, "entries": [{"name": "a"}]}, "the manifest is damaged"),
+        (
+            {"format": FORMAT, "recipe": RECIPE, "entries": [{"name": "a"}]},
+            "the manifest is damaged",
+        ),
     ],
 )
-def test_other_and_damaged_manifests_are_left_alone(tmp_path: Path, manifest: dict[str, Any], message: str) -> None:
+def test_other_and_damaged_manifests_are_left_alone(
+    tmp_path: Path, manifest: dict[str, Any], message: str
+) -> None:
     text = json.dumps(manifest)
     (tmp_path / MANIFEST).write_text(text)
     with pytest.raises(InputError, match=message):
@@ -177,7 +190,9 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("damage", DAMAGED)
 @pytest.mark.parametrize("array", ARRAYS)
 def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) -> None:
-    """`prepare` loads the arrays of a set to draw its overview, without looking at the checksums."""
+    """`prepare` loads the arrays of a set to draw its overview,
+    without looking at the checksums.
+    """
     pixel_set = make_set()
     path = pixel_set.folder / "a" / f"{array}.npy"
     path.unlink()
@@ -190,12 +205,28 @@ def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) ->
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("n_pixels", 41, r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)"),
+        (
+            "n_pixels",
+            41,
+            r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)",
+        ),
         ("n_lights", 29, r"observations\.npy: .* expected \(40, 29\)"),
-        ("name", 2.5, r"manifest\.json: .*Expected `str`, got `float` - at `\$\.entries\[0\]\.name`"),
+        (
+            "name",
+            2.5,
+            r"manifest\.json: .*Expected `str`, got `float` - at `\$\.entries\[0\]\.name`",
+        ),
         ("name", "../b", r"manifest\.json: '\.\./b' is not the name of a folder"),
-        ("sha256", {"observations": "0" * 64}, r"manifest\.json: .* \(the entry 'a' lacks a checksum\)"),
-        ("sha256", None, r"manifest\.json: .*Expected `object`, got `null` - at `\$\.entries\[0\]\.sha256`"),
+        (
+            "sha256",
+            {"observations": "0" * 64},
+            r"manifest\.json: .* \(the entry 'a' lacks a checksum\)",
+        ),
+        (
+            "sha256",
+            None,
+            r"manifest\.json: .*Expected `object`, got `null` - at `\$\.entries\[0\]\.sha256`",
+        ),
         ("name", "..", r"manifest\.json: '\.\.' is not the name of a folder"),
         ("n_lights", "30", r"manifest\.json: .*Expected `int`"),
         ("n_pixels", 0, r"manifest\.json: .*Expected `int` >= 1 - at"),
@@ -216,7 +247,10 @@ def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message:
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ("[]", "not the manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
+        (
+            "[]",
+            "not the manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'",
+        ),
         ('{"format": "splinecli-pixel-set-2"}', "found format 'splinecli-pixel-set-2', expected"),
         (f'{{"format": "{FORMAT}", "complete": true}}', "Object missing required field"),
     ],

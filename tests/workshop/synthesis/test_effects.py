@@ -1,4 +1,6 @@
-"""Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is left to chance."""
+"""Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is
+left to chance.
+"""
 
 import math
 from dataclasses import fields, replace
@@ -53,20 +55,32 @@ def test_walls_have_the_stated_shapes() -> None:
 
 
 def matte(pixels: int) -> PrincipledMaterial:
-    """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection away."""
+    """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection
+    away.
+    """
     zero = torch.zeros(pixels, 1)
     plain = {field.name: zero for field in fields(PrincipledMaterial)}
-    plain |= {"base": zero + 1, "roughness": zero + 0.1, "interface_loss": zero + 1e-9, "minnaert": zero + 1}
+    plain |= {
+        "base": zero + 1,
+        "roughness": zero + 0.1,
+        "interface_loss": zero + 1e-9,
+        "minnaert": zero + 1,
+    }
     return PrincipledMaterial(**plain | {"tail_exponent": zero + 2, "second_roughness": zero + 1})
 
 
 def mirror(pixels: int) -> PrincipledMaterial:
-    return replace(matte(pixels), metallic=torch.ones(pixels, 1), roughness=torch.full((pixels, 1), 0.2))
+    return replace(
+        matte(pixels), metallic=torch.ones(pixels, 1), roughness=torch.full((pixels, 1), 0.2)
+    )
 
 
 def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     normals = draw_visible_normals(50, generator(1))
-    wall = replace(draw_wall(normals, 1.0, generator()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool))
+    wall = replace(
+        draw_wall(normals, 1.0, generator()),
+        has_pixel_material=torch.zeros(50, 1, dtype=torch.bool),
+    )
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)
     arriving = (normals * wall.towards).sum(dim=1, keepdim=True).clamp(min=0)
@@ -79,12 +93,15 @@ def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
 
 
 def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
-    """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall, to the camera."""
+    """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall,
+    to the camera.
+    """
     one, half = torch.ones(1, 1), math.sqrt(0.5)
     side, facing = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[-half, 0.0, half]])
     sizes = dict.fromkeys(("tan_height", "tan_half_width", "softness", "reflectance"), one)
     wall = Wall(azimuth=side, towards=side, facing=facing, has_pixel_material=one > 0, **sizes)
-    # A wall at 45 degrees sends light from the zenith to the pixel, which faces camera and wall equally.
+    # A wall at 45 degrees sends light from the zenith to the pixel, which faces camera and wall
+    # equally.
     mirrored, elsewhere = [0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]
     facing, away = torch.tensor([[half, 0.0, half]]), torch.tensor([[0.2, 0.0, math.sqrt(0.96)]])
     lights = torch.tensor([mirrored, elsewhere])
@@ -109,14 +126,19 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
 
     # Azimuths from the wall's: 45 degrees high and 30 to either side.
     lights = torch.tensor(
-        [towards(*a) for a in [(0, 40), (0, 50), (25, 20), (35, 20), (-25, 20), (-35, 20), (180, 10)]]
+        [
+            towards(*a)
+            for a in [(0, 40), (0, 50), (25, 20), (35, 20), (-25, 20), (-35, 20), (180, 10)]
+        ]
     )
     assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
 
 
 def test_ambient_light() -> None:
     ambient = draw_ambient(N, 0.3, generator())
-    assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
+    assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(
+        0.3, abs=SHARE
+    )
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
     assert not draw_ambient(N, 0.0, generator()).any()
 
@@ -140,7 +162,9 @@ def test_errors_of_light_directions() -> None:
     # Sigma itself is estimated from 80 numbers, to 8 per cent.
     assert stats.kstest(sigma[disturbed], lambda x: (x / 8).clip(0, 1) ** (1 / 3)).statistic < 0.04
     assert 6 < sigma.max() < 10
-    np.testing.assert_allclose(disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6)
+    np.testing.assert_allclose(
+        disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6
+    )
 
 
 def test_errors_of_light_intensities() -> None:
@@ -192,13 +216,16 @@ def is_multiple(values: Tensor, steps: float) -> Tensor:
 def test_quantisation() -> None:
     exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
     quantised = quantise(exposed, 0.3, generator())
-    decoded = torch.from_numpy(decode_transfer(np.arange(256, dtype=np.float32) / 255, None)).double()
+    decoded = torch.from_numpy(
+        decode_transfer(np.arange(256, dtype=np.float32) / 255, None)
+    ).double()
     of_srgb = (quantised[..., None] - decoded).abs().amin(dim=2).amax(dim=1) < 1e-6
     eight = is_multiple(quantised, 255)
     assert of_srgb.double().mean().item() == pytest.approx(0.15, abs=SHARE)
     assert eight.double().mean().item() == pytest.approx(0.15, abs=SHARE)
     error = quantised - exposed
-    # The high byte of 16 is up to a step of 255 too dark or, as 256 steps become 255, a little too bright.
+    # The high byte of 16 is up to a step of 255 too dark or, as 256 steps become 255, a little too
+    # bright.
     cut = eight & (error.abs().amax(dim=1) > 0.5001 / 255)
     assert 0.06 < cut.double().mean().item() <= 0.075 + SHARE
     assert (error[cut].mean() * 255).item() == pytest.approx(0, abs=0.02)
@@ -215,14 +242,17 @@ def test_light_intensities() -> None:
     assert intensities.amax(dim=1).sub(1).abs().max() == 0
     unequal = intensities.amin(dim=1) < 1
     assert unequal.float().mean().item() == pytest.approx(0.4, abs=SHARE)
-    # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's upper end by that.
+    # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's
+    # upper end by that.
     assert intensities.min() >= 0.25
     assert not (draw_light_intensities(N, 10, 0.0, generator()) != 1).any()
 
 
 def test_restoring_half_of_the_clipped_pixels() -> None:
     lights = tilted_lights(400, 12)
-    normals = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1)))
+    normals = torch.nn.functional.normalize(
+        torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1))
+    )
     truth = (lights * normals[:, None]).sum(dim=2).clamp(min=0)
     truth = 1.4 * truth / truth.amax(dim=1, keepdim=True)
     valid = torch.arange(12).expand(400, 12) < 10
@@ -283,7 +313,9 @@ def test_rigs_are_ellipses_of_the_stated_axes() -> None:
     assert largest_deg.min() > 18.5
     assert stats.kstest(largest_deg, stats.uniform(20, 20).cdf).pvalue > 1e-3
     assert small.mean() == pytest.approx(20 / 68, abs=0.05)
-    assert stats.kstest(axes[small, 0] / axes[small, 1], stats.uniform(0.5, 0.5).cdf).statistic < 0.07
+    assert (
+        stats.kstest(axes[small, 0] / axes[small, 1], stats.uniform(0.5, 0.5).cdf).statistic < 0.07
+    )
 
 
 def test_cones_are_narrow() -> None:
@@ -299,8 +331,11 @@ def test_rings_have_one_elevation() -> None:
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
     assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
     assert np.median(polar_deg.std(axis=1)) == pytest.approx(2, abs=0.15)
-    # The mean direction of a whole ring is the view axis. An arc of A has sin(A / 2) / (A / 2) of a ring's radius.
-    off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(np.radians(polar_deg.mean(axis=1)))
+    # The mean direction of a whole ring is the view axis. An arc of A has sin(A / 2) / (A / 2) of a
+    # ring's radius.
+    off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(
+        np.radians(polar_deg.mean(axis=1))
+    )
     assert 0.4 < (off_axis < 0.03).mean() < 0.6
     assert off_axis.max() < math.sin(math.radians(60)) / math.radians(60) + 0.05
 
@@ -317,6 +352,6 @@ def test_hand_held_lights_come_in_clusters() -> None:
     angles += 360 * np.eye(12)
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
     assert polar_deg.min() > 20 - 24 and np.median(polar_deg) == pytest.approx(45, abs=3)
-    # Three of four rigs have at least two lights a cluster, which are 6 sqrt(2) degrees apart on average, or closer
-    # where a turn about the axis moves them less.
+    # Three of four rigs have at least two lights a cluster, which are 6 sqrt(2) degrees apart on
+    # average, or closer where a turn about the axis moves them less.
     assert (np.median(angles.min(axis=2), axis=1) < 12).mean() > 0.6

@@ -1,7 +1,7 @@
 """Rendered scenes against Mitsuba 3's path tracer, where that is installed (pip install mitsuba).
 
-The full comparison is benchmarks/render_accuracy.py; here a small image under two lights is enough to catch a
-wrong lobe, factor, frame or bounce.
+The full comparison is benchmarks/render_accuracy.py; here a small image under two lights is enough
+to catch a wrong lobe, factor, frame or bounce.
 """
 
 import importlib
@@ -23,14 +23,21 @@ from splinecli.workshop.synthesis.meshes import (
     torus,
     triangulate,
 )
-from splinecli.workshop.synthesis.scenes import RenderedScene, Scene, SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.scenes import (
+    RenderedScene,
+    Scene,
+    SceneConfig,
+    draw_scene,
+    render_scene,
+)
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 mitsuba: Any = pytest.importorskip("mitsuba", reason="Mitsuba is the oracle")
 
 SIZE, SAMPLES = 32, 256
 CONFIG = SceneConfig(size=SIZE, samples=4, directions=256)
-# Pixels along the edge of the blocks whose means are compared: single pixels are noise above all, of either side.
+# Pixels along the edge of the blocks whose means are compared: single pixels are noise above all,
+# of either side.
 BLOCK = 4
 
 
@@ -46,9 +53,13 @@ def bowl_with_ring() -> Mesh:
     def distance(points: Floats) -> Floats:
         radius = np.linalg.norm(points, axis=1)
         above = points[:, 2] + np.float32(0.1)
-        shell = smooth_cut(radius - np.float32(0.9), np.maximum(radius - np.float32(0.78), -1), 0.03)
+        shell = smooth_cut(
+            radius - np.float32(0.9), np.maximum(radius - np.float32(0.78), -1), 0.03
+        )
         bowl = smooth_cut(shell, -above, 0.05)
-        ring = moved(torus(0.35, 0.1), np.eye(3, dtype=np.float32), np.array((0.2, 0.1, -0.3), np.float32))
+        ring = moved(
+            torus(0.35, 0.1), np.eye(3, dtype=np.float32), np.array((0.2, 0.1, -0.3), np.float32)
+        )
         return smooth_union(bowl, ring(points), 0.05)
 
     mesh = triangulate(distance, (1.0, 1.0, 1.0), 0.03)
@@ -57,13 +68,18 @@ def bowl_with_ring() -> Mesh:
 
 @pytest.fixture(scope="module")
 def scene(benchmark: ModuleType) -> Scene:
-    # Of the first scenes of this seed one with a few patches: edges inside pixels are noise at this size.
+    # Of the first scenes of this seed one with a few patches: edges inside pixels are noise at this
+    # size.
     mesh = bowl_with_ring()
     drawn = (draw_scene(3, index, CONFIG, mesh) for index in range(100))
     few = next(one for one in drawn if 3 <= one.patch_of_face.max() + 1 <= 20)
     comparable: Scene = benchmark.comparable(few)
-    # Sharp lobes that light each other are noise in a path tracer, until it has thousands of samples.
-    blunt = {name: replace(one, roughness=one.roughness.clamp(min=0.4)) for name, one in comparable.materials.items()}
+    # Sharp lobes that light each other are noise in a path tracer, until it has thousands of
+    # samples.
+    blunt = {
+        name: replace(one, roughness=one.roughness.clamp(min=0.4))
+        for name, one in comparable.materials.items()
+    }
     return replace(comparable, materials=blunt)
 
 
@@ -87,13 +103,17 @@ def block_means(values: Floats, mask: NDArray[np.bool_]) -> Floats:
 
 
 @pytest.mark.parametrize("bounces", [0, 4])
-@pytest.mark.parametrize(("name", "most_off"), [("diffuse", 0.04), ("specular", 0.04), ("metallic", 0.06)])
+@pytest.mark.parametrize(
+    ("name", "most_off"), [("diffuse", 0.04), ("specular", 0.04), ("metallic", 0.06)]
+)
 def test_images_agree(scene, rendered, benchmark, name, bounces, most_off):
     ours = rendered[bounces]
     shapes = benchmark.mitsuba_shapes(scene, name)
     mine, theirs = [], []
     for light in (1, 2):
-        image = benchmark.render_with_mitsuba(shapes, SIZE, SAMPLES, scene.lights[light], depth=bounces + 2)
+        image = benchmark.render_with_mitsuba(
+            shapes, SIZE, SAMPLES, scene.lights[light], depth=bounces + 2
+        )
         theirs.append(block_means(image[ours.mask], ours.mask))
         mine.append(block_means(ours.observations[name][:, light], ours.mask))
     difference = np.abs(np.concatenate(mine) - np.concatenate(theirs))

@@ -18,20 +18,28 @@ from splinecli.workshop.synthesis.pixels import (
 )
 
 PLAIN = PixelGeneratorConfig(
-    light_direction_error_share=0.0, light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False
+    light_direction_error_share=0.0,
+    light_intensity_error_share=0.0,
+    saturated_share=0.0,
+    sensor_noise=False,
 )
 NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.0, mixed_share=0.0)
 
 
 def draw(pixels: int, config: PixelGeneratorConfig | None = None, seed: int = 0) -> PixelBatch:
-    return PixelGenerator(config or PixelGeneratorConfig(), torch.Generator().manual_seed(seed)).draw(pixels)
+    return PixelGenerator(
+        config or PixelGeneratorConfig(), torch.Generator().manual_seed(seed)
+    ).draw(pixels)
 
 
 def test_batches_hold_what_a_capture_would() -> None:
     batch = draw(4000)
     pixels, lights = batch.observations.shape
     assert pixels == 4000
-    assert (batch.light_directions.shape, batch.exposure.shape) == ((pixels, lights, 3), (pixels, 1))
+    assert (batch.light_directions.shape, batch.exposure.shape) == (
+        (pixels, lights, 3),
+        (pixels, 1),
+    )
     assert (batch.valid.shape, batch.valid.dtype) == ((pixels, lights), torch.bool)
     counts = batch.valid.sum(dim=1)
     assert counts.max() == lights <= 96
@@ -57,16 +65,22 @@ def test_each_pixel_is_turned_by_its_own_angle(config: PixelGeneratorConfig) -> 
     c, s = angle.cos()[:, None], angle.sin()[:, None]
     x, y, z = lights.unbind(-1)
     turned_lights = torch.stack((c * x - s * y, s * x + c * y, z), dim=-1)
-    torch.testing.assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(
+        turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4
+    )
 
 
-@pytest.mark.parametrize("share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"])
+@pytest.mark.parametrize(
+    "share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"]
+)
 def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> None:
     def dense(config: PixelGeneratorConfig) -> torch.Tensor:
         return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_truth().values
 
     assert (dense(replace(NOTHING, **{share: 1.0})) - dense(NOTHING)).abs().max() > 0.01
-    off = draw_scene(400, replace(PixelGeneratorConfig(), **{share: 0.0}), torch.Generator().manual_seed(0))
+    off = draw_scene(
+        400, replace(PixelGeneratorConfig(), **{share: 0.0}), torch.Generator().manual_seed(0)
+    )
     if share == "mixed_share":
         assert off.mixed is None
     elif share == "ambient_share":
@@ -82,7 +96,9 @@ def test_mixed_pixels_lie_between_their_surfaces() -> None:
     alone = replace(scene, mixed=None, mixed_weight=None).radiance(lights)
     second, blended = scene.mixed.radiance(lights), scene.radiance(lights)
     weight = scene.mixed_weight
-    torch.testing.assert_close(blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5
+    )
     assert torch.equal(blended[200:], alone[200:])
     # Edges have another normal and the same material; blends the reverse.
     edge = torch.arange(200) % 2 == 0
@@ -97,7 +113,8 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
     normals = draw_visible_normals(20_000, torch.Generator().manual_seed(0)).double()
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-6
     assert (normals[:, 2] > 0).all()
-    # Uniform by projected area: r^2 is uniform over 0..0.997^2, and so is the azimuth over the circle.
+    # Uniform by projected area: r^2 is uniform over 0..0.997^2, and so is the azimuth over the
+    # circle.
     squared = (normals[:, 0] ** 2 + normals[:, 1] ** 2).numpy()
     assert stats.kstest(squared, stats.uniform(0, 0.997**2).cdf).pvalue > 1e-3
     azimuth = torch.atan2(normals[:, 1], normals[:, 0]).numpy()
@@ -119,7 +136,9 @@ def test_pixels_of_a_capture_share_its_lights_and_its_exposure() -> None:
     exact = draw(160, SHARED)
     radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid
     clipped = radiance > 1
-    torch.testing.assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6
+    )
     brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))
     assert (brightest > 0.15).all() and (brightest <= 1).all()
     assert draw(10, SHARED).captures == 1  # of fewer pixels than usual

@@ -1,4 +1,6 @@
-"""The principled BRDF against its equations, written out a second time in numpy with explicit vectors."""
+"""The principled BRDF against its equations, written out a second time in numpy with explicit
+vectors.
+"""
 
 from dataclasses import fields
 
@@ -16,8 +18,14 @@ NAMES = tuple(field.name for field in fields(PrincipledMaterial))
 
 
 def material(**values: float) -> PrincipledMaterial:
-    plain = dict.fromkeys(NAMES, 0.0) | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0} | values
-    return PrincipledMaterial(**{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()})
+    plain = (
+        dict.fromkeys(NAMES, 0.0)
+        | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0}
+        | values
+    )
+    return PrincipledMaterial(
+        **{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()}
+    )
 
 
 def hemisphere(count: int, seed: int = 0) -> Vectors:
@@ -28,22 +36,41 @@ def hemisphere(count: int, seed: int = 0) -> Vectors:
 
 def radiance(surface: PrincipledMaterial, normal: Vectors, lights: Vectors) -> Vectors:
     n_dot_l = torch.from_numpy(lights @ normal)[None]
-    return surface.shade(n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])).numpy()[0]
+    return surface.shade(
+        n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])
+    ).numpy()[0]
 
 
 def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
-    """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping.
+    """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012
+    remapping.
 
     The height of the highlight's distribution by quadrature: projected facets have unit area.
     """
-    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss, kappa, gamma, share, second, retro = (
-        float(getattr(surface, name)) for name in NAMES
-    )
+    (
+        base,
+        metallic,
+        specular,
+        roughness,
+        sheen,
+        clearcoat,
+        gloss,
+        loss,
+        kappa,
+        gamma,
+        share,
+        second,
+        retro,
+    ) = (float(getattr(surface, name)) for name in NAMES)
 
     def facets(nh: float, nl: float, nv: float, roughness: float, gamma: float) -> float:
         alpha = max(roughness, 0.1) ** 2
         area, _ = integrate.quad(
-            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma, 0, 1, points=[1 - alpha**2], epsrel=1e-9
+            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
+            0,
+            1,
+            points=[1 - alpha**2],
+            epsrel=1e-9,
         )
         ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
         return float(ndf * g1(nl, alpha) * g1(nv, alpha))
@@ -70,10 +97,14 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         diffuse += base / np.pi * retro * ((1 + light @ v) / 2) ** 20
         f0 = (1 - metallic) * 0.08 * specular + metallic * base
         fresnel = f0 + (1 - f0) * schlick(lh)
-        lobe = (1 - share) * facets(nh, nl, nv, roughness, gamma) + share * facets(nh, nl, nv, second, 2)
+        lobe = (1 - share) * facets(nh, nl, nv, roughness, gamma) + share * facets(
+            nh, nl, nv, second, 2
+        )
         lobe *= fresnel / (4 * nl * nv)
         coat_alpha = 0.1 * (1 - gloss) + 0.001 * gloss
-        coat_ndf = (coat_alpha**2 - 1) / (np.pi * np.log(coat_alpha**2) * (1 + (coat_alpha**2 - 1) * nh**2))
+        coat_ndf = (coat_alpha**2 - 1) / (
+            np.pi * np.log(coat_alpha**2) * (1 + (coat_alpha**2 - 1) * nh**2)
+        )
         coat_fresnel = 0.04 + 0.96 * schlick(lh)
         coat = coat_ndf * coat_fresnel * g1(nl, 0.25) * g1(nv, 0.25) / (4 * nl * nv)
         f = (1 - metallic) * (diffuse + sheen * schlick(lh)) + lobe + 0.25 * clearcoat * coat
@@ -90,7 +121,9 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         material(metallic=0.3, specular=1.0, roughness=0.7),
         material(interface_loss=1.0, specular=0.5),
         material(minnaert=1.4, sheen=0.3),
-        material(metallic=1.0, roughness=0.3, tail_exponent=1.6, clearcoat=4.0, clearcoat_gloss=0.5),
+        material(
+            metallic=1.0, roughness=0.3, tail_exponent=1.6, clearcoat=4.0, clearcoat_gloss=0.5
+        ),
         material(metallic=1.0, roughness=0.6, second_share=0.3, second_roughness=0.2),
         material(specular=2.0, tail_exponent=1.5, second_share=0.7, second_roughness=0.8),
         material(retro=0.5),
@@ -103,7 +136,9 @@ def test_agrees_with_the_published_equations(surface: PrincipledMaterial) -> Non
     for normal in hemisphere(4, seed=1):
         expected = burley(surface, normal, lights)
         assert expected.any()
-        np.testing.assert_allclose(radiance(surface, normal, lights), expected, rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(
+            radiance(surface, normal, lights), expected, rtol=1e-5, atol=1e-12
+        )
 
 
 def test_float32_is_close_to_float64() -> None:
@@ -114,7 +149,9 @@ def test_float32_is_close_to_float64() -> None:
     normals = torch.from_numpy(hemisphere(200, seed=2)) + torch.tensor((0.0, 0.0, 0.2))
     normals = torch.nn.functional.normalize(normals, dim=1)
     exact = double.shade(normals @ lights.T, normals[:, 2:], lights[:, 2])
-    coarse = surface.shade((normals @ lights.T).float(), normals[:, 2:].float(), lights[:, 2].float())
+    coarse = surface.shade(
+        (normals @ lights.T).float(), normals[:, 2:].float(), lights[:, 2].float()
+    )
     assert torch.isfinite(coarse).all()
     # Half a per cent in a peak of the narrowest lobes, whose height float32 resolves no better.
     assert ((coarse - exact).abs() / (exact + 0.01)).max() < 5e-3
@@ -137,10 +174,12 @@ def test_drawn_materials_have_the_stated_classes() -> None:
         (values["interface_loss"] > 0, 0.6),
         (values["minnaert"] != 1, 0.7),
         (values["tail_exponent"] < 2, 0.5),
-        # Half of what is no metal is log-uniform from 0.02, of which log10(2.5) / 1.7 lies under 0.05.
+        # Half of what is no metal is log-uniform from 0.02, of which log10(2.5) / 1.7 lies under
+        # 0.05.
         ((values["base"] < 0.05)[~metal], 0.5 * np.log10(0.05 / 10**-1.7) / 1.7),
     ):
-        assert flags.mean() == pytest.approx(share, abs=4 * np.sqrt(0.25 / len(flags)))  # four standard deviations
+        # four standard deviations
+        assert flags.mean() == pytest.approx(share, abs=4 * np.sqrt(0.25 / len(flags)))
     assert (values["specular"][metal] <= 1).all() and values["base"][metal].min() >= 0.05
     assert not values["sheen"][metal].any() and not values["retro"][metal].any()
     rough = values["roughness"]

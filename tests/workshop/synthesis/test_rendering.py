@@ -38,26 +38,38 @@ class Matte:
 def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A matte surface has no sharp lobes that the renderer would soften."""
     soften = rendering.soften
-    monkeypatch.setattr(rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found))
+    monkeypatch.setattr(
+        rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found)
+    )
 
 
 def matte(reflectance: float) -> dict[str, Matte]:
     return {"matte": Matte(torch.full((1, 1), reflectance))}
 
 
-def ball(radius: float, *, polar: float, inward: bool, rings: int = 120, sectors: int = 240) -> Mesh:
-    """The part of a sphere within `polar` degrees of its pole: +z seen from outside, or -z seen from inside."""
+def ball(
+    radius: float, *, polar: float, inward: bool, rings: int = 120, sectors: int = 240
+) -> Mesh:
+    """The part of a sphere within `polar` degrees of its pole: +z seen from outside, or -z seen
+    from inside.
+    """
     theta = np.linspace(1e-4, np.radians(polar), rings)
     phi = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
     t, p = (grid.ravel() for grid in np.meshgrid(theta, phi, indexing="ij"))
     sign = -1 if inward else 1
     unit = np.stack((np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), sign * np.cos(t)), axis=1)
-    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij"))
+    row, column = (
+        grid.ravel()
+        for grid in np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
+    )
     a, b = row * sectors + column, row * sectors + (column + 1) % sectors
     c, d = a + sectors, b + sectors
-    # Anticlockwise from outside at +z, and from inside at -z: the same order of the azimuth either way.
+    # Anticlockwise from outside at +z, and from inside at -z: the same order of the azimuth either
+    # way.
     faces = np.concatenate((np.stack((a, c, b), axis=1), np.stack((b, c, d), axis=1)))
-    return Mesh((radius * unit).astype(np.float32), faces.astype(np.int32), (sign * unit).astype(np.float32))
+    return Mesh(
+        (radius * unit).astype(np.float32), faces.astype(np.int32), (sign * unit).astype(np.float32)
+    )
 
 
 def pixel_centres(view_mask: np.ndarray) -> np.ndarray:
@@ -77,7 +89,8 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
     visible = find_visible_surface(tracer, 64, 3)
     centres = pixel_centres(visible.mask)
     assert (np.hypot(*centres.T) < 0.9).all()
-    # Four fifths of the radius: the outermost pixels are cut by the outline or seen at a grazing angle.
+    # Four fifths of the radius: the outermost pixels are cut by the outline or seen at a grazing
+    # angle.
     assert visible.mask.sum() > 0.8 * np.pi * (0.45 * 64) ** 2
     x, y = (centres / 0.9).T
     normals = np.stack((x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))), axis=1)
@@ -88,10 +101,13 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
     parts = (tracer, visible, lights, matte(0.7), np.zeros(len(tracer.mesh.faces), np.int64))
     direct = render_direct(*parts)["matte"].numpy()
     expected = 0.7 * np.maximum(normals @ lights.T, 0)
-    # Cells of the terminator are half lit; elsewhere the mean over a pixel is its middle's value, nearly.
+    # Cells of the terminator are half lit; elsewhere the mean over a pixel is its middle's value,
+    # nearly.
     assert np.abs(direct - expected)[well_inside].max() < 0.02
     assert np.abs(direct - expected)[well_inside].mean() < 0.002
-    indirect = render_indirect(*parts, directions=16, bounces=3, generator=torch.Generator().manual_seed(0))["matte"]
+    indirect = render_indirect(
+        *parts, directions=16, bounces=3, generator=torch.Generator().manual_seed(0)
+    )["matte"]
     assert indirect.abs().max() == 0
 
 
@@ -101,15 +117,20 @@ def floor_with_wall() -> Mesh:
     corners += [(0.2, -1, 0), (0.2, 1, 0), (0.2, 1, 0.4), (0.2, -1, 0.4)]
     faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
     normals = [(0, 0, 1)] * 4 + [(-1, 0, 0)] * 4
-    return Mesh(np.array(corners, np.float32), np.array(faces, np.int32), np.array(normals, np.float32))
+    return Mesh(
+        np.array(corners, np.float32), np.array(faces, np.int32), np.array(normals, np.float32)
+    )
 
 
 def test_a_wall_casts_its_shadow() -> None:
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 2)
-    # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there is none.
+    # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there
+    # is none.
     lights = directions((1, 0, 1), (-1, 0, 1))
-    direct = render_direct(tracer, visible, lights, matte(1.0), np.zeros(4, np.int64))["matte"].numpy()
+    direct = render_direct(tracer, visible, lights, matte(1.0), np.zeros(4, np.int64))[
+        "matte"
+    ].numpy()
     x = pixel_centres(visible.mask)[:, 0]
     in_shadow = (x > -0.2 + 0.04) & (x < 0.2 - 0.04)
     in_light = (x < -0.2 - 0.04) | (x > 0.2 + 0.04)
@@ -128,29 +149,35 @@ def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() 
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 1)
     lamps = np.array([(-2.0, 0.3, 1.0), (-0.8, 1.2, 3.0), (1.5, -0.4, 0.9)])
-    found = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(4, np.int64))["matte"].numpy()
+    found = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(4, np.int64))[
+        "matte"
+    ].numpy()
     points = visible.samples.position
     distance = np.linalg.norm(lamps - points[:, None], axis=2)
     expected = 0.7 * lamps[:, 2] * np.linalg.norm(lamps, axis=1) ** 2 / distance**3
-    share = (0.2 - points[:, :1]) / (lamps[:, 0] - points[:, :1])  # of the ray to the lamp, where it passes x = 0.2
+    # of the ray to the lamp, where it passes x = 0.2
+    share = (0.2 - points[:, :1]) / (lamps[:, 0] - points[:, :1])
     clear = ~((share > 0) & (share * lamps[:, 2] < 0.4))
-    sure = (np.abs(share * lamps[:, 2] - 0.4) > 0.02) & (np.abs(points[:, 1:2]) < 0.8)  # the wall ends at 1
+    # the wall ends at 1
+    sure = (np.abs(share * lamps[:, 2] - 0.4) > 0.02) & (np.abs(points[:, 1:2]) < 0.8)
     np.testing.assert_allclose(found[sure], (expected * clear)[sure], rtol=1e-5)
     assert 0.1 < clear[sure].mean() < 0.95
 
 
 @pytest.mark.parametrize("bounces", [1, 4])
 def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
-    # From any point of a sphere every part of it of area dA has the form factor dA / (4 pi R^2). A half sphere
-    # of reflectance rho, its mouth to the light: the flux pi R^2 falls in, rho of it is spread evenly, and of
-    # what is spread a half meets the bowl again.
+    # From any point of a sphere every part of it of area dA has the form factor dA / (4 pi R^2). A
+    # half sphere of reflectance rho, its mouth to the light: the flux pi R^2 falls in, rho of it is
+    # spread evenly, and of what is spread a half meets the bowl again.
     rho, radius = 0.8, 0.9
     tracer = Tracer(ball(radius, polar=90, inward=True))
     visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0, 0, 1))
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
     generator = torch.Generator().manual_seed(0)
-    indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)["matte"].numpy()[:, 0]
+    indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)[
+        "matte"
+    ].numpy()[:, 0]
     indirect /= visible.coverage
     again = rho / 2
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
@@ -166,7 +193,9 @@ def test_patches_have_their_own_material() -> None:
     visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
     patch_of_face = np.array([0, 1, 0, 0])  # the floor's triangles meet on its diagonal y = x
-    direct = render_direct(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)["matte"][:, 0]
+    direct = render_direct(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)[
+        "matte"
+    ][:, 0]
     x, y = pixel_centres(visible.mask).T
     below, above = y < x - 0.11, y > x + 0.11
     np.testing.assert_allclose(direct[below], 0.25, rtol=1e-5)
@@ -177,10 +206,12 @@ def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface() -> 
     corners = np.array([(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
     tracer = Tracer(Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up))
-    # Pixels are 0.2 wide. The edge at 0.7 leaves half of a column of pixels, which is 6 of 9 samples; the others are
-    # cut at their last third, or between pixels.
+    # Pixels are 0.2 wide. The edge at 0.7 leaves half of a column of pixels, which is 6 of 9
+    # samples; the others are cut at their last third, or between pixels.
     visible = find_visible_surface(tracer, 10, 3)
-    direct = render_direct(tracer, visible, directions((0, 0, 1)), matte(1.0), np.zeros(2, np.int64))["matte"]
+    direct = render_direct(
+        tracer, visible, directions((0, 0, 1)), matte(1.0), np.zeros(2, np.int64)
+    )["matte"]
     picture = np.zeros((10, 10))
     picture[visible.mask] = direct[:, 0]
     np.testing.assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)

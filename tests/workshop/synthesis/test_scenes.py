@@ -20,10 +20,14 @@ SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 
 def tent() -> Mesh:
     """Two slopes that meet in a valley along y."""
-    corners = np.array([(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32)
+    corners = np.array(
+        [(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32
+    )
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)], np.int32)
     slope = np.sqrt(0.5)
-    normals = np.array([(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2)
+    normals = np.array(
+        [(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2
+    )
     return Mesh(corners, faces, normals.astype(np.float32))
 
 
@@ -59,7 +63,8 @@ def test_lights_cover_the_upper_hemisphere() -> None:
     lights = draw_lights(500, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(lights, axis=1), 1, atol=1e-5)
     assert (lights[:, 2] > MIN_LIGHT_Z).all()
-    # Uniform by solid angle: z is uniform over 0..1, and every direction has a light within a few mean distances.
+    # Uniform by solid angle: z is uniform over 0..1, and every direction has a light within a few
+    # mean distances.
     assert np.histogram(lights[:, 2], bins=5, range=(0, 1))[0] == pytest.approx(100, abs=15)
     probes = np.random.default_rng(1).normal(size=(500, 3))
     probes[:, 2] = np.abs(probes[:, 2])

@@ -1,4 +1,6 @@
-"""Procedural shapes: sound surfaces, true normals, hollows, fields against closed forms; meshes as files give them."""
+"""Procedural shapes: sound surfaces, true normals, hollows, fields against closed forms; meshes as
+files give them.
+"""
 
 import time
 import zipfile
@@ -11,8 +13,21 @@ import pytest
 
 from splinecli.errors import InputError
 from splinecli.workshop.synthesis import meshes
-from splinecli.workshop.synthesis.meshes import REACH, Floats, Mesh, fit_to_frame, read_mesh, split_long_edges
-from splinecli.workshop.synthesis.shapes import KINDS, Relief, draw_detail, draw_shape_of_kind, read_relief
+from splinecli.workshop.synthesis.meshes import (
+    REACH,
+    Floats,
+    Mesh,
+    fit_to_frame,
+    read_mesh,
+    split_long_edges,
+)
+from splinecli.workshop.synthesis.shapes import (
+    KINDS,
+    Relief,
+    draw_detail,
+    draw_shape_of_kind,
+    read_relief,
+)
 
 pytest.importorskip("skimage", reason="needs the extra 'render'")
 
@@ -33,7 +48,8 @@ def points(count: int = 2000, seed: int = 0) -> Floats:
 def test_solids_are_true_distances(field: meshes.Field) -> None:
     at = points()
     slope = np.linalg.norm(meshes.gradient(field, at), axis=1)
-    # But on the creases of the box's inside and on axes, which few points are near, distance grows at unit rate.
+    # But on the creases of the box's inside and on axes, which few points are near, distance grows
+    # at unit rate.
     assert np.abs(slope - 1).mean() < 0.01
     # And a step along it by the distance meets the surface.
     foot = at - field(at)[:, None] * meshes.gradient(field, at)
@@ -48,7 +64,8 @@ def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
     np.testing.assert_array_equal(union[apart], np.minimum(first, second)[apart])
     below = np.minimum(first, second) - union
     assert below.min() >= -1e-7
-    assert below.max() == pytest.approx(0.025, abs=1e-3)  # a quarter of the blend, where both are alike
+    # a quarter of the blend, where both are alike
+    assert below.max() == pytest.approx(0.025, abs=1e-3)
     cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
     np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
 
@@ -75,7 +92,9 @@ def test_crumbs_and_the_empty_field_are_dropped() -> None:
     assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
 
-def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skipping_what_is_far_from_the_surface_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     noise = meshes.waves(np.random.default_rng(0), 1.0)
 
     def lumps(at: Floats) -> Floats:
@@ -106,10 +125,13 @@ def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatc
     agreement = (facing * mesh.vertex_normals[mesh.faces].mean(axis=1)).sum(axis=1)
     # Facets turn away from the field's normals in creases alone.
     assert np.quantile(agreement, 0.1) > 0.9
-    # A convex body lies on one side of all its tangent planes; of these surfaces a good part lies outside some.
+    # A convex body lies on one side of all its tangent planes; of these surfaces a good part lies
+    # outside some.
     rng = np.random.default_rng(0)
     here, there = (rng.integers(len(mesh.vertices), size=4000) for _ in range(2))
-    above = ((mesh.vertices[there] - mesh.vertices[here]) * mesh.vertex_normals[here]).sum(axis=1) > 0.02
+    above = ((mesh.vertices[there] - mesh.vertices[here]) * mesh.vertex_normals[here]).sum(
+        axis=1
+    ) > 0.02
     assert above.mean() > 0.03
 
 
@@ -177,7 +199,9 @@ def area(mesh: Mesh) -> float:
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "stl_ascii", "off"])
-def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path: Path, ending: str) -> None:
+def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(
+    tmp_path: Path, ending: str
+) -> None:
     path = tmp_path / f"ball.{ending}"
     ball = trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40))
     ball.export(path, file_type=ending)
@@ -194,7 +218,9 @@ def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path: Path
 def test_the_wider_side_fits_and_the_shape_is_kept() -> None:
     box = trimesh.creation.box((4.0, 1.0, 2.0))
     vertices = box.vertices.astype(np.float32) + np.float32(3)
-    mesh = fit_to_frame(Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32)))
+    mesh = fit_to_frame(
+        Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
+    )
     extent = np.ptp(mesh.vertices, axis=0)
     np.testing.assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
     np.testing.assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
@@ -217,7 +243,11 @@ def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path
 
 def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))
-    mesh = Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
+    mesh = Mesh(
+        box.vertices.astype(np.float32),
+        box.faces.astype(np.int32),
+        box.vertex_normals.astype(np.float32),
+    )
     fine = split_long_edges(mesh, longest=0.1)
     assert len(fine.faces) > 600
     assert area(fine) == pytest.approx(area(mesh), rel=1e-6)
@@ -233,8 +263,13 @@ def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
         ("broken.ply", "ply, but not really", r"broken\.ply: not a mesh that can be read"),
         ("notes.txt", "nothing but words", "not a mesh that can be read"),
         ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", r"points\.obj: .*(no faces|not a mesh)"),
-        # A triangle seen from its edge alone, along the viewing direction, has no width in the image.
-        ("needle.obj", "v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n", "no extent that a camera along -z could see"),
+        # A triangle seen from its edge alone, along the viewing direction, has no width in the
+        # image.
+        (
+            "needle.obj",
+            "v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n",
+            "no extent that a camera along -z could see",
+        ),
     ):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=reason):
@@ -246,7 +281,9 @@ def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None
     for ending in ("zip", "ply"):
         with zipfile.ZipFile(tmp_path / f"archive.{ending}", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("a.ply", ball.export(file_type="ply"))
-        with pytest.raises(InputError, match=r"not a mesh that can be read .*is in none of these formats"):
+        with pytest.raises(
+            InputError, match=r"not a mesh that can be read .*is in none of these formats"
+        ):
             read_mesh(tmp_path / f"archive.{ending}")
     ball.export(tmp_path / "ball.glb")
     with pytest.raises(InputError, match="Give a triangle mesh as PLY, OBJ, STL or OFF"):

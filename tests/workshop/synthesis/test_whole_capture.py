@@ -1,4 +1,6 @@
-"""Backgrounds, and the camera of a capture, against what its parts do to points, ramps and constants."""
+"""Backgrounds, and the camera of a capture, against what its parts do to points, ramps and
+constants.
+"""
 
 import math
 
@@ -46,7 +48,9 @@ def test_the_object_stays(seed: int) -> None:
 
 
 def test_shadows_fall_away_from_the_light() -> None:
-    """A light at the right, 45 degrees up, moves the shadow left by the distance; one above moves it down."""
+    """A light at the right, 45 degrees up, moves the shadow left by the distance; one above moves
+    it down.
+    """
     mask, side = disc(), math.sqrt(0.5)
     right, above = _shadows(mask, torch.tensor([[side, 0, side], [0, side, side]]), 7)
     assert torch.equal(right[:, :-7], mask[:, 7:])
@@ -73,13 +77,18 @@ def test_a_piece(seed: int) -> None:
 def test_round_pieces_turn_away_at_their_rim() -> None:
     """On average, the normals point away from the middle, and more so further out."""
     for seed in range(6):
-        normals, _, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed), round_share=1.0)
+        normals, _, mask = draw_engraved(
+            SIZE, LIGHTS, torch.Generator().manual_seed(seed), round_share=1.0
+        )
         assert 0.25 < mask.float().mean() < 0.8 and not mask[0].any()
         rows, columns = mask.nonzero().float().T
         outwards = torch.stack((columns - columns.mean(), rows.mean() - rows), dim=1)
         radius = outwards.norm(dim=1)
         along = (normals[:, :2] * torch.nn.functional.normalize(outwards, dim=1)).sum(1)
-        inner, outer = along[radius < radius.median()].mean(), along[radius >= radius.median()].mean()
+        inner, outer = (
+            along[radius < radius.median()].mean(),
+            along[radius >= radius.median()].mean(),
+        )
         assert 0 < inner < outer
 
 
@@ -87,7 +96,10 @@ SHARP = torch.ones(3, 1, 1)
 
 
 def camera(
-    kernels: torch.Tensor = SHARP, demosaic: int | None = None, sharpening: float = 0.0, quality: int | None = None
+    kernels: torch.Tensor = SHARP,
+    demosaic: int | None = None,
+    sharpening: float = 0.0,
+    quality: int | None = None,
 ) -> Optics:
     return Optics(kernels, (0.25, 0.5, 0.25), demosaic, sharpening, 1.0, quality)
 

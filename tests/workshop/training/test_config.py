@@ -32,7 +32,10 @@ def test_round_trip_through_json(name: str) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight"),
+        (
+            {"stepz": 5},
+            "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight",
+        ),
         ({"network": {"lights": 5}}, "unknown network setting 'lights'"),
         ({"pixels": ["wall_share"]}, "'pixels' is .* expected a table of settings"),
         ({"steps": 0}, "training setting 'steps' is 0; expected a whole number of at least 1"),
@@ -41,10 +44,16 @@ def test_round_trip_through_json(name: str) -> None:
         ({"schedule": "linear"}, "'schedule' is 'linear'; expected 'cosine' or 'stepped'"),
         ({"pixels": {"wall_share": 1.5}}, "'wall_share' is 1.5; expected a number from 0 to 1"),
         ({"pixels": {"cast_shadows": 1}}, "'cast_shadows' is 1; expected true or false"),
-        ({"pixels": {"min_lights": 9, "max_lights": 8}}, "max_lights are 9, 10, 8; expected them in rising order"),
+        (
+            {"pixels": {"min_lights": 9, "max_lights": 8}},
+            "max_lights are 9, 10, 8; expected them in rising order",
+        ),
         ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
-        ({"sources": {"set": True}}, "'sources' is {'set': True}; expected a table, each a number of at least 0"),
+        (
+            {"sources": {"set": True}},
+            "'sources' is {'set': True}; expected a table, each a number of at least 0",
+        ),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:
@@ -56,10 +65,19 @@ def test_presets_by_name() -> None:
     # The paper's section 4; its code where that is silent (docs/train.md).
     paper = preset("paper").to_dict()
     published = {
-        "batch_size": 128, "learning_rate": 1e-4, "steps": 200_000, "beta1": 0.9, "beta2": 0.999, "weight_decay": 0.0,
-        "updates": "alternating", "ne_net_updates": 5, "symmetric_weight": 2e-2, "asymmetric_weight": 2e-5,
-        "eta": 1.0, "lambda_c": 50.0,
-    }  # fmt: skip
+        "batch_size": 128,
+        "learning_rate": 1e-4,
+        "steps": 200_000,
+        "beta1": 0.9,
+        "beta2": 0.999,
+        "weight_decay": 0.0,
+        "updates": "alternating",
+        "ne_net_updates": 5,
+        "symmetric_weight": 2e-2,
+        "asymmetric_weight": 2e-5,
+        "eta": 1.0,
+        "lambda_c": 50.0,
+    }
     assert paper | published == paper
     assert tuple(PRESETS) == training.PRESET_NAMES
     assert training.DEFAULT_PRESET in PRESETS
@@ -73,7 +91,9 @@ def write(path: Path, text: str) -> Path:
 @pytest.mark.parametrize("asked", [None, "compact"])
 def test_a_toml_file_over_a_preset(tmp_path: Path, asked: str | None) -> None:
     """A preset that is asked for by name comes before the file's."""
-    text = 'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
+    text = (
+        'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
+    )
     base = preset(asked or "paper")
     pixels, network = replace(base.pixels, wall_share=0.3), replace(base.network, map_size=16)
     expected = replace(base, batch_size=64, pixels=pixels, network=network)
@@ -138,14 +158,18 @@ def test_bad_parameters(text: str) -> None:
 
 def test_a_run_on_other_sources_is_refused(tmp_path: Path) -> None:
     other = configure(changes=[{"sources": {"/data/set": 1.0}}], base=TrainingConfig())
-    with pytest.raises(ModelError, match=r"the run was started with sources\./data/set = None, not 1\.0") as caught:
+    with pytest.raises(
+        ModelError, match=r"the run was started with sources\./data/set = None, not 1\.0"
+    ) as caught:
         check_resumable(TrainingConfig(), other, tmp_path)
     assert caught.value.path == tmp_path
 
 
 def test_a_setting_that_is_not_given_stays_as_it_was() -> None:
     started = preset("compact", seed=5, batch_size=32)
-    assert configure(base=started) == configure(changes=[{"batch_size": 32}], base=started) == started
+    assert (
+        configure(base=started) == configure(changes=[{"batch_size": 32}], base=started) == started
+    )
     # A preset gives all settings.
     assert configure("compact", changes=[{"seed": 5}], base=started) == preset("compact", seed=5)
 
@@ -158,7 +182,9 @@ def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
     check_resumable(started, asked, tmp_path)
 
 
-def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_home_folder_is_expanded_in_every_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     config = configure(changes=[{"sources": {"~/set": 1.0}}, {"start_from": "~/mine.safetensors"}])
     assert config.sources == {str(tmp_path / "set"): 1.0}
@@ -166,7 +192,8 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"), [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))]
+    ("text", "expected"),
+    [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
 )
 def test_light_counts(text: str, expected: tuple[int, int, int]) -> None:
     assert tuple(parse_light_counts(text).values()) == expected
@@ -181,8 +208,12 @@ def test_sources_of_the_command_line() -> None:
 
 
 def test_removed_settings_of_earlier_versions(tmp_path: Path) -> None:
-    unused = write(tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n")
+    unused = write(
+        tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n"
+    )
     assert configure("compact", unused) == preset("compact")
     used = write(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
-    with pytest.raises(ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"):
+    with pytest.raises(
+        ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"
+    ):
         configure("compact", used)

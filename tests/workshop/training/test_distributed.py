@@ -21,7 +21,11 @@ STEPS = 6
 
 
 def environment(**more: str) -> dict[str, str]:
-    kept = {name: text for name, text in os.environ.items() if not name.startswith(("TORCHELASTIC", "PYTEST"))}
+    kept = {
+        name: text
+        for name, text in os.environ.items()
+        if not name.startswith(("TORCHELASTIC", "PYTEST"))
+    }
     return kept | {"OMP_NUM_THREADS": "1"} | more
 
 
@@ -59,7 +63,9 @@ def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Pat
     address = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", WORKER, str(STEPS)], cwd=tmp_path, env=environment(RANK=rank, **address)
+            [sys.executable, "-c", WORKER, str(STEPS)],
+            cwd=tmp_path,
+            env=environment(RANK=rank, **address),
         )
         for rank in "01"
     ]
@@ -106,16 +112,27 @@ run()
 
 
 def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
-    # On the processor, one process of two is killed after the first checkpoint; torchrun starts both again.
+    # On the processor, one process of two is killed after the first checkpoint; torchrun starts
+    # both again.
     (tmp_path / "worker.py").write_text(FAILING)
     steps = 30
-    settings = ["network.width=8", "network.li_blocks=1", "network.ne_blocks=1", "network.head_width=8"]
+    settings = [
+        "network.width=8",
+        "network.li_blocks=1",
+        "network.ne_blocks=1",
+        "network.head_width=8",
+    ]
     settings += ["batch_size=8", "precision=float32"]
     options = [word for setting in settings for word in ("--param", setting)]
-    command = f"{sys.executable} -m torch.distributed.run --standalone --max-restarts 1 --nproc-per-node 2 worker.py"
+    command = (
+        f"{sys.executable} -m torch.distributed.run --standalone --max-restarts 1 --nproc-per-node"
+        " 2 worker.py"
+    )
     command += f" train -o run --steps {steps} --device cpu"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    torchrun = subprocess.Popen([*command.split(), *options], cwd=tmp_path, env=environment(), text=True, **pipes)
+    torchrun = subprocess.Popen(
+        [*command.split(), *options], cwd=tmp_path, env=environment(), text=True, **pipes
+    )
     try:
         out, err = torchrun.communicate(timeout=100)
     finally:

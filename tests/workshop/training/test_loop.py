@@ -1,4 +1,6 @@
-"""The training loop: it learns, it can be stopped and taken up, and it says when it cannot go on."""
+"""The training loop: it learns, it can be stopped and taken up,
+and it says when it cannot go on.
+"""
 
 import itertools
 import json
@@ -72,26 +74,37 @@ def losses(trainer: Trainer, steps: int) -> list[float]:
     return [trainer.step()[0].item() for _ in range(steps)]
 
 
-@pytest.mark.parametrize(("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")])
+@pytest.mark.parametrize(
+    ("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")]
+)
 def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, updates, pixels):
     sources = {"generator": {GENERATOR: 1.0}, "set": {}, "both": {GENERATOR: 1.0}}[pixels]
     if pixels != "generator":
         sources[str(make_set().folder)] = 1.0
     weights = {"symmetric_weight": 0.02, "asymmetric_weight": 1e-4}
-    config = replace(tiny, updates=updates, ne_net_updates=2, sources=sources, warmup_steps=4, **weights)
+    config = replace(
+        tiny, updates=updates, ne_net_updates=2, sources=sources, warmup_steps=4, **weights
+    )
     whole = Trainer(config, tmp_path / "whole", CPU)
     expected = losses(whole, 6)
     first = Trainer(config, tmp_path / "halves", CPU)
     assert losses(first, 3) == expected[:3]
     first.save()
     torch.rand(100)  # what others draw in between does not matter
-    second = Trainer(read_checkpoint_config(tmp_path / "halves" / CHECKPOINT), tmp_path / "halves", CPU, resume=True)
+    second = Trainer(
+        read_checkpoint_config(tmp_path / "halves" / CHECKPOINT),
+        tmp_path / "halves",
+        CPU,
+        resume=True,
+    )
     assert second.counters == first.counters
     # The same operations on the same numbers; only their places in memory differ.
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
-            torch.testing.assert_close(getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7)
+            torch.testing.assert_close(
+                getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7
+            )
 
 
 def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_path: Path) -> None:
@@ -109,7 +122,9 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_pat
     assert all(torch.equal(again.network.state_dict()[name], trained[name]) for name in trained)
 
 
-def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(
+    tiny: TrainingConfig, tmp_path: Path
+) -> None:
     alone = replace(tiny, network=replace(tiny.network, map_size=16, set_width=16, set_layers=1))
     first = Trainer(alone, tmp_path / "first", CPU)
     first.run()
@@ -124,42 +139,69 @@ def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(tiny: Trai
     contexts = load_weights(tmp_path / "second" / WEIGHTS).network.set_branch.contexts
     assert contexts is not None and contexts[0].join[2].weight.any()
     with pytest.raises(ModelError, match="with sees_capture = True, the run's has False"):
-        Trainer(replace(alone, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
+        Trainer(
+            replace(alone, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU
+        )
 
 
 def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path / "first", CPU).run()
     config = replace(
-        tiny, network=replace(tiny.network, error_head=True), updates="error_head", steps=40, learning_rate=0.01,
-        start_from=str(tmp_path / "first" / WEIGHTS), average_decay=0.0, weight_decay=0.1,
-    )  # fmt: skip
+        tiny,
+        network=replace(tiny.network, error_head=True),
+        updates="error_head",
+        steps=40,
+        learning_rate=0.01,
+        start_from=str(tmp_path / "first" / WEIGHTS),
+        average_decay=0.0,
+        weight_decay=0.1,
+    )
     second = Trainer(config, tmp_path / "second", CPU)
     (batch, _), *_ = second.task.draw(second.counters.step)[0]
     before = compute_losses(second.network, batch, config, part="error_head").total.item()
     second.run()
-    assert compute_losses(second.network, batch, config, part="error_head").total.item() < before - 0.1
+    assert (
+        compute_losses(second.network, batch, config, part="error_head").total.item() < before - 0.1
+    )
     # Normals are what they were, to the last bit.
     first, last = (load_weights(tmp_path / name / WEIGHTS).network for name in ("first", "second"))
     assert set(last.state_dict()) - set(first.state_dict()) == {
-        f"ne_net.error_head.layers.{layer}.{kind}" for layer in (0, 2) for kind in ("weight", "bias")
+        f"ne_net.error_head.layers.{layer}.{kind}"
+        for layer in (0, 2)
+        for kind in ("weight", "bias")
     }
-    assert all(torch.equal(last.state_dict()[name], value) for name, value in first.state_dict().items())
+    assert all(
+        torch.equal(last.state_dict()[name], value) for name, value in first.state_dict().items()
+    )
     # Trained further, the networks lose it.
     further = replace(tiny, start_from=str(tmp_path / "second" / WEIGHTS))
-    assert set(Trainer(further, tmp_path / "third", CPU).network.state_dict()) == set(first.state_dict())
+    assert set(Trainer(further, tmp_path / "third", CPU).network.state_dict()) == set(
+        first.state_dict()
+    )
     for settings in ({"updates": "error_head"}, {"network": config.network}):
         with pytest.raises(ModelError, match="the updates 'error_head' and 'refine_net' need"):
             replace(tiny, **settings)
 
 
-def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_writes_its_files(
+    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
     seen: list[tuple[float, Metrics]] = []
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
     last = trainer.run(lambda progress, metrics: seen.append((progress, metrics)))
     # And the pictures, which are not drawn here.
-    assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, "config.json", METRICS, WEIGHTS]
-    assert [(progress, metrics.step) for progress, metrics in seen] == [(0.4, 4), (0.8, 8), (1.0, 10)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        CHECKPOINT,
+        "config.json",
+        METRICS,
+        WEIGHTS,
+    ]
+    assert [(progress, metrics.step) for progress, metrics in seen] == [
+        (0.4, 4),
+        (0.8, 8),
+        (1.0, 10),
+    ]
     assert seen[-1][1] == last
     header = (tmp_path / METRICS).read_text().splitlines()[0]
     assert header.split(",") == [field.name for field in fields(Metrics)]
@@ -172,13 +214,21 @@ def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatc
     again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
-    assert TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text())) == trainer.config
+    assert (
+        TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text()))
+        == trainer.config
+    )
 
 
-def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A clock that moves by 0.05 s each time it is read: the machine's own speed is not what is tested.
+def test_minutes_bound_a_run(
+    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A clock that moves by 0.05 s each time it is read: the machine's own speed is not what is
+    # tested.
     readings = itertools.count()
-    monkeypatch.setattr("splinecli.workshop.training.loop.time.monotonic", lambda: next(readings) * 0.05)
+    monkeypatch.setattr(
+        "splinecli.workshop.training.loop.time.monotonic", lambda: next(readings) * 0.05
+    )
     trainer = Trainer(replace(tiny, steps=1, minutes=0.01), tmp_path, CPU)
     trainer.counters.seconds = 0.3
     assert trainer.progress == pytest.approx(0.5)
@@ -208,9 +258,13 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, wha
     losses(trainer, 2)
     trainer.save()
     files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    weights = [p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())]
+    weights = [
+        p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())
+    ]
     poison(trainer, what)
-    with pytest.raises(ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"):
+    with pytest.raises(
+        ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"
+    ):
         trainer.run()
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     after = (*trainer.network.parameters(), *trainer.average.parameters())
@@ -264,13 +318,18 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
     return made
 
 
-def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer: Trainer, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_version_or_kind_is_refused(
+    trainer: Trainer, tmp_path: Path
+) -> None:
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
     save_weights(trainer.network, path)
-    with pytest.raises(ModelError, match="found splinecli-weights-1, expected splinecli-checkpoint-2"):
+    with pytest.raises(
+        ModelError, match="found splinecli-weights-1, expected splinecli-checkpoint-2"
+    ):
         read_checkpoint_config(path)
-    # The checksum does not cover the header. The new text has the same length, so that the header stays valid.
+    # The checksum does not cover the header. The new text has the same length, so that the header
+    # stays valid.
     assert whole.count(b"batch_size") == 1
     path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
     with pytest.raises(ModelError, match="unknown training setting 'batch_sise'"):
@@ -278,8 +337,12 @@ def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer: Trainer, tm
     renamed = whole.replace(b'\\"pixels\\": 16', b'\\"pixelz\\": 16')
     assert renamed != whole
     path.write_bytes(renamed)
-    with pytest.raises(ModelError, match=r"the entry 'clock' in the file .* unknown field `pixelz`"):
+    with pytest.raises(
+        ModelError, match=r"the entry 'clock' in the file .* unknown field `pixelz`"
+    ):
         Trainer(trainer.config, tmp_path, CPU, resume=True)
-    path.write_bytes(whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0'))
+    path.write_bytes(
+        whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0')
+    )
     with pytest.raises(ModelError, match="the entry 'config' in the file is not JSON"):
         read_checkpoint_config(path)

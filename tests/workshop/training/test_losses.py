@@ -48,7 +48,9 @@ def test_angle(degrees: float) -> None:
     assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
 
 
-@pytest.mark.parametrize(("norm", "expected"), [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)])
+@pytest.mark.parametrize(
+    ("norm", "expected"), [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)]
+)
 def test_map_loss_is_over_the_known_cells_of_each_pixel(norm: Norm, expected: float) -> None:
     known = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     known[0, ..., 1:3, 1:3] = 1
@@ -74,13 +76,19 @@ def test_mirror_against_scipy(azimuth_deg: int) -> None:
     column = (np.hypot(x, y) * np.cos(angle) + 1) * size / 2 - 0.5
     row = (1 - np.hypot(x, y) * np.sin(angle)) * size / 2 - 0.5
     expected = map_coordinates(maps[0, 0].numpy(), (row, column), order=1, mode="grid-constant")
-    np.testing.assert_allclose(mirror(maps, at(30, azimuth_deg))[0, 0].numpy(), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        mirror(maps, at(30, azimuth_deg))[0, 0].numpy(), expected, rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, AXIS_LENGTH / 2, AXIS_LENGTH, 1.0])
 def test_gradients_in_the_normal_are_finite(length: float) -> None:
-    normal = torch.tensor([[length, 0.0, math.sqrt(1 - length**2)]], dtype=torch.float64, requires_grad=True)
-    asymmetries(random_maps(1, 1, 32, 32), normal, torch.ones(1, 1, 32, 32).double())[0].mean().backward()
+    normal = torch.tensor(
+        [[length, 0.0, math.sqrt(1 - length**2)]], dtype=torch.float64, requires_grad=True
+    )
+    asymmetries(random_maps(1, 1, 32, 32), normal, torch.ones(1, 1, 32, 32).double())[
+        0
+    ].mean().backward()
     assert torch.isfinite(normal.grad).all()
 
 
@@ -92,7 +100,8 @@ def four_cells(**cells: float) -> Tensor:
     return maps
 
 
-# The axis lies along x, so row 0 mirrors row 3 and row 1 row 2. The loss is for eta = 0.1 and lambda_c = 2.
+# The axis lies along x, so row 0 mirrors row 3 and row 1 row 2. The loss is for eta = 0.1 and
+# lambda_c = 2.
 @pytest.mark.parametrize(
     ("maps", "filled", "fine", "coarse", "loss"),
     [
@@ -108,7 +117,9 @@ def four_cells(**cells: float) -> Tensor:
         (four_cells(r0c0=0.9), 2 * four_cells(r3c0=0.0), 0.0, 0.0, 0.1 + 2 * 0.1),
     ],
 )
-def test_asymmetries_by_hand(maps: Tensor, filled: Tensor | float, fine: float, coarse: float, loss: float) -> None:
+def test_asymmetries_by_hand(
+    maps: Tensor, filled: Tensor | float, fine: float, coarse: float, loss: float
+) -> None:
     found = asymmetries(maps, at(30, 0), torch.ones_like(maps) * filled)
     assert [value.item() for value in found] == pytest.approx([fine, coarse], abs=1e-12)
     assert asymmetric_loss(*found, eta=0.1, lambda_c=2.0).item() == pytest.approx(loss)
@@ -133,11 +144,18 @@ def moved(module: nn.Module) -> bool:
     return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
 
 
-def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_a_step_for_one_network_leaves_the_other_bitwise_alone(
+    tiny: TrainingConfig, tmp_path: Path
+) -> None:
     config = replace(
-        tiny, updates="alternating", ne_net_updates=2, weight_decay=0.1, learning_rate=1e-2,
-        symmetric_weight=0.02, asymmetric_weight=1e-4,
-    )  # fmt: skip
+        tiny,
+        updates="alternating",
+        ne_net_updates=2,
+        weight_decay=0.1,
+        learning_rate=1e-2,
+        symmetric_weight=0.02,
+        asymmetric_weight=1e-4,
+    )
     trainer = Trainer(config, tmp_path, CPU)
 
     def state(name: str) -> list[Tensor]:
@@ -161,11 +179,21 @@ def test_the_angle_reaches_li_net_through_the_fixed_ne_net(tiny, network, batch)
 
 @pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
 @pytest.mark.parametrize(("li_net_norm", "ne_net_norm"), [("mean", "sum"), ("sum", "mean")])
-def test_the_total_is_the_weighted_sum_of_its_terms(tiny, network, batch, part, li_net_norm, ne_net_norm):
+def test_the_total_is_the_weighted_sum_of_its_terms(
+    tiny, network, batch, part, li_net_norm, ne_net_norm
+):
     config = replace(
-        tiny, angle_weight=0.7, map_weight=0.5, masked_weight=0.3, symmetric_weight=0.02,
-        asymmetric_weight=1e-3, eta=2.0, lambda_c=10.0, li_net_norm=li_net_norm, ne_net_norm=ne_net_norm,
-    )  # fmt: skip
+        tiny,
+        angle_weight=0.7,
+        map_weight=0.5,
+        masked_weight=0.3,
+        symmetric_weight=0.02,
+        asymmetric_weight=1e-3,
+        eta=2.0,
+        lambda_c=10.0,
+        li_net_norm=li_net_norm,
+        ne_net_norm=ne_net_norm,
+    )
     with torch.no_grad():
         found = compute_losses(network, batch, config, part=part)
         views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
@@ -208,19 +236,29 @@ def test_a_degree_counts_more_on_a_capture_that_is_nearly_right() -> None:
     assert (gradient[0] / gradient[1]).item() == pytest.approx(math.sqrt(22.5 / 3.5))
     typical = torch.tensor([math.radians(2.5)] * 3)
     assert balanced(typical).item() == pytest.approx(typical[0].item())
-    assert balanced(typical, torch.full((3,), math.radians(7.5))).item() == pytest.approx(typical[0].item() / 2**0.5)
+    assert balanced(typical, torch.full((3,), math.radians(7.5))).item() == pytest.approx(
+        typical[0].item() / 2**0.5
+    )
 
 
 @pytest.mark.parametrize("mirror", [False, True])
 def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: bool) -> None:
-    # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map there.
+    # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map
+    # there.
     network = SplineNet(tiny.network)
     batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(40)
     directions, inside = cell_directions()
     lights = directions[inside][3::29]
     exposure = torch.linspace(0.3, 2, 40)[:, None]
     observations = batch.truth.radiance(lights) * exposure
-    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.truth, exposure, len(exposure))
+    seen = PixelBatch(
+        observations,
+        lights,
+        torch.ones_like(observations) > 0,
+        batch.truth,
+        exposure,
+        len(exposure),
+    )
     # Without a turn beyond multiples of 90 degrees, centres stay centres.
     views = network.build_maps(observations, lights)._replace(
         cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror
@@ -228,12 +266,18 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     dense = dense_truth_in_frame(seen, views, size=32)
     normals = to_pixel_frame(seen.truth.normals, views)
     turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
-    expected_normals = torch.stack((-seen.truth.normals[:, 1], *seen.truth.normals[:, [0, 2]].unbind(1)), dim=1)
+    expected_normals = torch.stack(
+        (-seen.truth.normals[:, 1], *seen.truth.normals[:, [0, 2]].unbind(1)), dim=1
+    )
     if mirror:
-        turned, expected_normals = (vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals))
+        turned, expected_normals = (
+            vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals)
+        )
     sparse = sparse_map(observations / views.scale, turned)
     assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(
+        dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4
+    )
     torch.testing.assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))
@@ -248,4 +292,6 @@ def test_without_li_net_the_angle_is_all(tiny: TrainingConfig, batch: PixelBatch
     assert torch.equal(losses.total, losses.angle)
     assert all(torch.isnan(term) for term in losses[2:])
     losses.total.backward()
-    assert all(parameter.grad is not None and parameter.grad.any() for parameter in network.parameters())
+    assert all(
+        parameter.grad is not None and parameter.grad.any() for parameter in network.parameters()
+    )

@@ -28,9 +28,13 @@ from splinecli.workshop.training.tasks import RefinementTask
 
 CPU = torch.device("cpu")
 FLAWLESS = CaptureConfig(
-    light_direction_error_share=0.0, light_intensity_error_share=0.0, unequal_lights_share=0.0,
-    saturated_share=0.0, sensor_noise=False, ambient_share=0.0,
-)  # fmt: skip
+    light_direction_error_share=0.0,
+    light_intensity_error_share=0.0,
+    unequal_lights_share=0.0,
+    saturated_share=0.0,
+    sensor_noise=False,
+    ambient_share=0.0,
+)
 
 
 def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tensor]:
@@ -42,7 +46,9 @@ def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tenso
 
 def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
     radiance, directions = scene()
-    observations, calibrated, _ = photograph_scene(radiance, directions, FLAWLESS, torch.Generator().manual_seed(0))
+    observations, calibrated, _ = photograph_scene(
+        radiance, directions, FLAWLESS, torch.Generator().manual_seed(0)
+    )
     exposure = (observations / radiance)[radiance < 0.9].unique()
     assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
     torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
@@ -53,10 +59,14 @@ def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()
     config = replace(FLAWLESS, ambient_share=1.0)
-    observations, _, exposure = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(4))
+    observations, _, exposure = photograph_scene(
+        radiance, directions, config, torch.Generator().manual_seed(4)
+    )
     added = torch.where(observations < 1, observations / exposure - radiance, torch.nan)
     assert added.nan_to_num(0).amax(1).sub(added.nan_to_num(9).amin(1)).max() < 1e-5
-    means = torch.stack((radiance.mean(dim=1), torch.full((len(radiance),), float(radiance.mean()))), dim=1)
+    means = torch.stack(
+        (radiance.mean(dim=1), torch.full((len(radiance),), float(radiance.mean()))), dim=1
+    )
     shares = torch.linalg.lstsq(means, added.nanmean(1)).solution
     assert shares.min() > 0 and 10**-3.2 < shares.sum() < 0.1
 
@@ -65,7 +75,9 @@ def test_errors_of_calibration_are_those_of_the_capture() -> None:
     """Every pixel has the same factor under one light."""
     radiance, directions = scene()
     config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
-    observations, *_ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(1))
+    observations, *_ = photograph_scene(
+        radiance, directions, config, torch.Generator().manual_seed(1)
+    )
     factors = torch.where(radiance < 0.9, observations / radiance, torch.nan)
     spread = factors.nan_to_num(0).amax(0) - factors.nan_to_num(9).amin(0)
     assert spread.max() < 1e-5
@@ -73,13 +85,17 @@ def test_errors_of_calibration_are_those_of_the_capture() -> None:
 
 
 def test_saturated_captures_are_restored() -> None:
-    """A matte scene whose brightest observations are clipped comes out as it was, apart from the exposure."""
+    """A matte scene whose brightest observations are clipped comes out as it was, apart from the
+    exposure.
+    """
     generator = torch.Generator().manual_seed(5)
     _, directions = scene(lights=12)
     normals = torch.nn.functional.normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
     radiance = normals @ directions.T * torch.rand(400, 1, generator=generator)
     config = replace(FLAWLESS, saturated_share=1.0)
-    observations, *_ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(2))
+    observations, *_ = photograph_scene(
+        radiance, directions, config, torch.Generator().manual_seed(2)
+    )
     assert observations.max() > 1.02
     ratio = observations / radiance
     assert ratio.std() < 0.03 * ratio.mean()
@@ -87,7 +103,9 @@ def test_saturated_captures_are_restored() -> None:
 
 @pytest.fixture
 def bumpy_set(tmp_path: Path) -> PixelSet:
-    """Two matte scenes of 14 x 14 pixels, a smooth normal each, whose pixels are disturbed one by one."""
+    """Two matte scenes of 14 x 14 pixels, a smooth normal each, whose pixels are disturbed one by
+    one.
+    """
     writer = PixelSetWriter(tmp_path / "bumpy")
     for index in range(2):
         rng = np.random.default_rng(index)
@@ -99,27 +117,42 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
         observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
         mask = np.ones((14, 14), np.bool_)
         writer.add(
-            f"s{index}", f"s{index}", "a test", {}, Pixels(observations.astype(np.float32), normals, lights, mask)
+            f"s{index}",
+            f"s{index}",
+            "a test",
+            {},
+            Pixels(observations.astype(np.float32), normals, lights, mask),
         )
     return writer.finish()
 
 
 @pytest.fixture
-def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch) -> TrainingConfig:
+def refining(
+    tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
+) -> TrainingConfig:
     for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
         monkeypatch.setattr(tasks, name, value)
     monkeypatch.setattr(refinement, "_ENGRAVED_SHARE", 0.0)
     monkeypatch.setattr(refinement, "_BACKGROUND_SHARE", 0.0)
     monkeypatch.setattr(refinement, "_ENLARGED_SHARE", 0.0)  # interpolated noise looks blurred
     return replace(
-        tiny, network=replace(tiny.network, error_head=True, refines=True), sources={str(bumpy_set.folder): 1.0},
-        pixels=replace(tiny.pixels, optics_share=0.0), updates="refine_net", batch_size=2, shards=1, steps=90,
-        learning_rate=1e-3, average_decay=0.0,
-    )  # fmt: skip
+        tiny,
+        network=replace(tiny.network, error_head=True, refines=True),
+        sources={str(bumpy_set.folder): 1.0},
+        pixels=replace(tiny.pixels, optics_share=0.0),
+        updates="refine_net",
+        batch_size=2,
+        shards=1,
+        steps=90,
+        learning_rate=1e-3,
+        average_decay=0.0,
+    )
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining: TrainingConfig, tmp_path: Path) -> None:
+def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
+    refining: TrainingConfig, tmp_path: Path
+) -> None:
     trainer = Trainer(refining, tmp_path / "run", CPU)
     before = {name: tensor.clone() for name, tensor in trainer.network.state_dict().items()}
     first_deg = trainer.task.validation_deg(trainer.average, bfloat16=False)
@@ -131,10 +164,17 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining: T
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_refinement_net_follows_one_that_is_trained(refining: TrainingConfig, tmp_path: Path) -> None:
+def test_a_second_refinement_net_follows_one_that_is_trained(
+    refining: TrainingConfig, tmp_path: Path
+) -> None:
     Trainer(refining, tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
-    twice = replace(refining, network=replace(refining.network, refines_twice=True), start_from=start_from, steps=3)
+    twice = replace(
+        refining,
+        network=replace(refining.network, refines_twice=True),
+        start_from=start_from,
+        steps=3,
+    )
     second = Trainer(twice, tmp_path / "second", CPU)
     first = load_weights(tmp_path / "first" / WEIGHTS).network.refine_net
     assert torch.equal(second.network.refine_net.out.weight, first.out.weight)
@@ -143,10 +183,18 @@ def test_a_second_refinement_net_follows_one_that_is_trained(refining: TrainingC
     assert found.again.out.weight.any()
     assert not torch.equal(found.out.weight, first.out.weight), "both learn together"
     with pytest.raises(ModelError, match="with refines_twice = True, the run's has False"):
-        Trainer(replace(refining, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU)
-    save_weights(SplineNet(replace(refining.network, refines=False)), tmp_path / "without.safetensors")
+        Trainer(
+            replace(refining, start_from=str(tmp_path / "second" / WEIGHTS)),
+            tmp_path / "third",
+            CPU,
+        )
+    save_weights(
+        SplineNet(replace(refining.network, refines=False)), tmp_path / "without.safetensors"
+    )
     with pytest.raises(ModelError, match="no refinement net"):
-        Trainer(replace(twice, start_from=str(tmp_path / "without.safetensors")), tmp_path / "run", CPU)
+        Trainer(
+            replace(twice, start_from=str(tmp_path / "without.safetensors")), tmp_path / "run", CPU
+        )
 
 
 def test_the_preset_continues_the_weights_that_it_starts_from() -> None:
@@ -176,7 +224,9 @@ def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> No
     # A turn changes no angle between estimate and truth, and so no loss before refinement.
     assert drawn.normals.shape == (3, 3, 26, 26)
     straight = refinement_losses(network, stack_maps([one])).before
-    torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(
+        refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3
+    )
 
 
 def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monkeypatch):
@@ -205,7 +255,9 @@ def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path
 
 
 def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: TrainingConfig) -> None:
-    """A plate in steps, all of it tilted as under wrong lights, or with its steps smoothed. The net changes nothing."""
+    """A plate in steps, all of it tilted as under wrong lights, or with its steps smoothed. The net
+    changes nothing.
+    """
     network = network_of(refining)
     slopes = torch.zeros(2, 24, 24)
     slopes[0, :, 12:] = 0.5
@@ -217,9 +269,15 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: Trai
         features = torch.zeros(1, CHANNELS, 24, 24)
         features[0, :3] = estimate
         maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))
-        return [refinement_losses(network, maps, detail_weight=weight).total.item() for weight in (0.0, 10.0)]
+        return [
+            refinement_losses(network, maps, detail_weight=weight).total.item()
+            for weight in (0.0, 10.0)
+        ]
 
-    tilted, smoothed = unit_of(slopes + 0.3), unit_of(torch.nn.functional.avg_pool2d(slopes, 5, 1, 2))
+    tilted, smoothed = (
+        unit_of(slopes + 0.3),
+        unit_of(torch.nn.functional.avg_pool2d(slopes, 5, 1, 2)),
+    )
     for estimate, most, least in ((tilted, 0.4, 0.0), (smoothed, 9.0, 0.5)):
         without, with_detail = losses_of(estimate)
         assert least < (with_detail - without) / without < most

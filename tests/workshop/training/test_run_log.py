@@ -60,8 +60,13 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) 
 def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
     assert {path.name for path in tmp_path.iterdir()} == {
-        "checkpoint.safetensors", "config.json", CURVES, TRAINING_MAPS, METRICS, "weights.safetensors",
-    }  # fmt: skip
+        "checkpoint.safetensors",
+        "config.json",
+        CURVES,
+        TRAINING_MAPS,
+        METRICS,
+        "weights.safetensors",
+    }
     assert decode_rgb((tmp_path / CURVES).read_bytes()).std() > 5
     assert decode_rgb((tmp_path / TRAINING_MAPS).read_bytes()).std() > 20
 

@@ -1,4 +1,6 @@
-"""Sources of training and validation pixels: weights of a mixture, and scenes kept for validation."""
+"""Sources of training and validation pixels: weights of a mixture,
+and scenes kept for validation.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,13 @@ def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, Pi
 
 
 def parts(batch: PixelBatch) -> tuple[torch.Tensor, ...]:
-    return batch.observations, batch.light_directions, batch.valid, batch.exposure, batch.truth.normals
+    return (
+        batch.observations,
+        batch.light_directions,
+        batch.valid,
+        batch.exposure,
+        batch.truth.normals,
+    )
 
 
 def entries_of(*scenes: str) -> list[Entry]:
@@ -44,13 +52,17 @@ def entries_of(*scenes: str) -> list[Entry]:
         (("a", "b", "c"), 0.0, 0),
     ],
 )
-def test_validation_takes_whole_scenes_and_never_all(scenes: tuple[str, ...], share: float, n_validation: int) -> None:
+def test_validation_takes_whole_scenes_and_never_all(
+    scenes: tuple[str, ...], share: float, n_validation: int
+) -> None:
     entries = entries_of(*scenes)
     training, validation = split_scenes(entries, share)
     for_validation = {entry.scene for entry in validation}
     assert len(for_validation) == n_validation
     assert {entry.scene for entry in training} == set(scenes) - for_validation
-    assert sorted(entry.name for entry in training + validation) == sorted(entry.name for entry in entries)
+    assert sorted(entry.name for entry in training + validation) == sorted(
+        entry.name for entry in entries
+    )
     # The order of the entries does not matter.
     again = split_scenes(entries[::-1], share)[1]
     assert {entry.scene for entry in again} == for_validation
@@ -69,7 +81,9 @@ def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
     return {tuple(normal) for normal in batch.truth.normals.tolist()}
 
 
-def test_training_never_draws_from_validation_scenes(make_set: MakeSet, tiny: TrainingConfig) -> None:
+def test_training_never_draws_from_validation_scenes(
+    make_set: MakeSet, tiny: TrainingConfig
+) -> None:
     pixel_set = make_set(entries=[("a1", "a", 20, 20), ("b1", "b", 20, 20), ("b2", "b", 20, 20)])
     source, held = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}))
     training, validation = source.draw(500), held.draw(300)
@@ -100,20 +114,35 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     stored = rows_of(pixel_set, *({"a", "b", "c"} - for_validation))
     # A batch has one source. The set gives a quarter of the batches.
     from_set = [sum(normal in stored for normal in normals_of(batch)) for batch in training]
-    assert all(count in (0, len(normals_of(batch))) for count, batch in zip(from_set, training, strict=True))
-    assert sum(count > 0 for count in from_set) == pytest.approx(15, abs=4 * np.sqrt(60 * 0.25 * 0.75))
-    found = set().union(*(normals_of(batch) for batch in validation)) & rows_of(pixel_set, "a", "b", "c")
+    assert all(
+        count in (0, len(normals_of(batch)))
+        for count, batch in zip(from_set, training, strict=True)
+    )
+    assert sum(count > 0 for count in from_set) == pytest.approx(
+        15, abs=4 * np.sqrt(60 * 0.25 * 0.75)
+    )
+    found = set().union(*(normals_of(batch) for batch in validation)) & rows_of(
+        pixel_set, "a", "b", "c"
+    )
     assert found <= rows_of(pixel_set, *for_validation)
     # Both kinds of truth give maps of one shape.
     assert {batch.truth.dense_truth(32).values.shape for batch in training} == {(5, 1, 32, 32)}
 
 
-def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set: MakeSet, tiny: TrainingConfig) -> None:
+def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
+    make_set: MakeSet, tiny: TrainingConfig
+) -> None:
     # Both sets have the same three shapes under other names.
-    one, other = (make_set(names, entries=[(name, name, 20, 20) for name in names]) for names in ("abc", "xyz"))
-    source, held = open_sources(replace(tiny, sources={str(one.folder): 1.0, str(other.folder): 1.0}))
+    one, other = (
+        make_set(names, entries=[(name, name, 20, 20) for name in names])
+        for names in ("abc", "xyz")
+    )
+    source, held = open_sources(
+        replace(tiny, sources={str(one.folder): 1.0, str(other.folder): 1.0})
+    )
     assert not normals_of(source.draw(600)) & normals_of(held.draw(600))
-    # The only scene of "alone" is a validation scene of the other set, so nothing is left for training.
+    # The only scene of "alone" is a validation scene of the other set, so nothing is left for
+    # training.
     order = ("p", "q") if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else ("q", "p")
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])

@@ -1,4 +1,6 @@
-"""Decoders of TIFF and of camera RAW files, and the errors that all decoders raise for damaged ones."""
+"""Decoders of TIFF and of camera RAW files, and the errors that all decoders raise for damaged
+ones.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ DAMAGED, COPY_AGAIN = "the image is damaged and cannot be read", "Copy or export
 
 @contextmanager
 def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> Iterator[None]:
-    """Convert any exception that a reader raises for a damaged file, one of a dozen types, to an InputError."""
+    """Convert any exception that a reader raises for a damaged file, one of a dozen types, to an
+    InputError.
+    """
     try:
         yield
     except SplinecliError:
@@ -52,10 +56,12 @@ _STDERR_LOCK = threading.Lock()
 
 @contextmanager
 def native_stderr() -> Iterator[list[str]]:
-    """Capture the messages that C libraries print to stderr; after the block, the list contains them.
+    """Capture the messages that C libraries print to stderr; after the block, the list contains
+    them.
 
-    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
-    around decoding. Output of other threads is lost meanwhile, unless it goes elsewhere (stderr_is_apart).
+    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may
+    do it, and only around decoding. Output of other threads is lost meanwhile, unless it goes
+    elsewhere (stderr_is_apart).
     """
     messages: list[str] = []
     with _STDERR_LOCK, tempfile.TemporaryFile() as store:
@@ -77,7 +83,9 @@ def native_stderr() -> Iterator[list[str]]:
 
 
 def stderr_is_apart() -> bool:
-    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while native_stderr catches."""
+    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while
+    native_stderr catches.
+    """
     try:
         return sys.stderr is None or sys.stderr.fileno() != 2
     except (OSError, ValueError):  # a stream without a descriptor
@@ -89,17 +97,22 @@ _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
 def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
-    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one that OpenCV decodes.
+    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one
+    that OpenCV decodes.
 
-    Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
-    every sample format, but has no decoder for some compressions (LZW). Raises InputError if the file is truncated,
-    damaged, or of a kind without linear gray or RGB values.
+    Values grow with brightness: if zero is white in the file, the values are inverted, as in
+    viewers. tifffile reads every sample format, but has no decoder for some compressions (LZW).
+    Raises InputError if the file is truncated, damaged, or of a kind without linear gray or RGB
+    values.
     """
     with first_page(file, path) as page:
-        # A part may expand to a thousand times the size of its pixels. So may a tile far larger than the picture. Empty
-        # parts have up to 2^16 bytes, such as the tables of a JPEG, and tiles up to 2^24 more than the picture.
+        # A part may expand to a thousand times the size of its pixels. So may a tile far larger
+        # than the picture. Empty parts have up to 2^16 bytes, such as the tables of a JPEG, and
+        # tiles up to 2^24 more than the picture.
         expanded = math.prod(page.chunks) * page.dtype.itemsize
-        if expanded > 2 * page.nbytes + (1 << 24) or max(page.databytecounts, default=0) > 2 * expanded + (1 << 16):
+        if expanded > 2 * page.nbytes + (1 << 24) or max(
+            page.databytecounts, default=0
+        ) > 2 * expanded + (1 << 16):
             raise ValueError
         size = os.fstat(file.fileno()).st_size
         parts = zip(page.dataoffsets, page.databytecounts, strict=True)
@@ -107,7 +120,9 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
             raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-            problem = f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            problem = (
+                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            )
             raise InputError(problem, path=path, hint="Export it as RGB")
         pixels = _decode_page(page)
         if photometric == _WHITE_IS_ZERO:
@@ -122,24 +137,34 @@ _PAGE = re.compile(r"(.+\.tiff?)\[(\d{1,4})\]", re.IGNORECASE)
 
 
 def page_of(path: Path) -> tuple[Path, int]:
-    """Return the file and the number, from 0, of a page as `pages` names it; 0 for any other path."""
+    """Return the file and the number, from 0, of a page as `pages` names it;
+    0 for any other path.
+    """
     found = _PAGE.fullmatch(path.name)
     return (path, 0) if found is None else (path.with_name(found[1]), int(found[2]))
 
 
 def pages(path: Path) -> list[Path]:
-    """Return a path for each page of a TIFF file, such as stack.tif[0]; the file alone for another or a damaged one."""
+    """Return a path for each page of a TIFF file, such as stack.tif[0]; the file alone for another
+    or a damaged one.
+    """
     try:
         with path.open("rb") as file, first_page(file, path) as page:
             count = len(page.parent.pages)
     except (InputError, OSError):
         return [path]
-    return [path.with_name(f"{path.name}[{number}]") for number in range(count)] if 1 < count < 10_000 else [path]
+    return (
+        [path.with_name(f"{path.name}[{number}]") for number in range(count)]
+        if 1 < count < 10_000
+        else [path]
+    )
 
 
 @contextmanager
 def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
-    """Yield the first page of an open TIFF file, or the page in the path. Raises InputError for a damaged file."""
+    """Yield the first page of an open TIFF file, or the page in the path. Raises InputError for a
+    damaged file.
+    """
     import tifffile
 
     logger = logging.getLogger("tifffile")
@@ -156,7 +181,9 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
 
 
 def _check_tags(file: BinaryIO, number: int) -> None:
-    """Raise ValueError for a tag with millions of values in a page up to this one: tifffile reads tags as a whole."""
+    """Raise ValueError for a tag with millions of values in a page up to this one: tifffile reads
+    tags as a whole.
+    """
     start = file.read(16)
     order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
     big = 43 in start[2:4]  # BigTIFF has wider numbers
@@ -169,7 +196,8 @@ def _check_tags(file: BinaryIO, number: int) -> None:
         for place in range(0, len(entries), entry):
             tag = int.from_bytes(entries[place : place + 2], order)
             values = int.from_bytes(entries[place + 4 : place + 4 + bytes_of], order)
-            # Tags with one value for each strip or tile; others, such as colour profiles, have more.
+            # Tags with one value for each strip or tile; others, such as colour profiles, have
+            # more.
             if values > (1 << 18 if tag in (273, 279, 324, 325) else 1 << 24):
                 raise ValueError
         following = file.read(8 if big else 4)
@@ -181,7 +209,9 @@ def _decode_page(page: Any) -> Array | None:
         return None
     try:
         pixels: Array = page.asarray()
-    except Exception as error:  # the type of the error for a missing codec depends on tifffile's version
+    except (
+        Exception
+    ) as error:  # the type of the error for a missing codec depends on tifffile's version
         if is_out_of_memory(error):
             raise
         return None
@@ -191,24 +221,55 @@ def _decode_page(page: Any) -> Array | None:
 
 
 RAW_SUFFIXES = (
-    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
-    ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
-)  # fmt: skip
+    ".dng",
+    ".nef",
+    ".nrw",
+    ".cr2",
+    ".cr3",
+    ".crw",
+    ".arw",
+    ".sr2",
+    ".srf",
+    ".raf",
+    ".orf",
+    ".rw2",
+    ".rwl",
+    ".pef",
+    ".srw",
+    ".3fr",
+    ".fff",
+    ".iiq",
+    ".mos",
+    ".mef",
+    ".mrw",
+    ".erf",
+    ".kdc",
+    ".dcr",
+    ".x3f",
+)
 """RAW files are recognised by their names, because the content of many looks like TIFF."""
 
 
 def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
-    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
-    with _libraw(path) as rawpy, path.open("rb") as file, native_stderr(), rawpy.imread(utf8_name(path, file)) as raw:
+    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises
+    InputError.
+    """
+    with (
+        _libraw(path) as rawpy,
+        path.open("rb") as file,
+        native_stderr(),
+        rawpy.imread(utf8_name(path, file)) as raw,
+    ):
         return (raw.sizes.height, raw.sizes.width, 3), 2
 
 
 def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
-    """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
+    """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or
+    1 (no filters).
 
-    They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
-    camera at one setting have the same scale. An orientation is ignored, as in all images. Raises InputError if rawpy
-    is not installed, or LibRaw cannot read the file.
+    They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is
+    saturated. All files of a camera at one setting have the same scale. An orientation is ignored,
+    as in all images. Raises InputError if rawpy is not installed, or LibRaw cannot read the file.
     """
     with _libraw(path) as rawpy:
         with native_stderr():  # kept short, because it also blocks progress bars
@@ -219,14 +280,17 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,
                 gamma=(1, 1),
-                # Other white balances differ between images, or bring red and blue to full scale before saturation.
+                # Other white balances differ between images, or bring red and blue to full scale
+                # before saturation.
                 user_wb=[1, 1, 1, 1],
                 no_auto_bright=True,
-                user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
+                # the default is each image's own maximum, if that is near
+                user_sat=_full_scale(raw),
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # Others interpolate differently under each light: normals of textured objects have two to three times
-                # the error (AHD 1.4 degrees, LINEAR 0.5), but uniform objects have half the error (0.2, 0.4).
+                # Others interpolate differently under each light: normals of textured objects have
+                # two to three times the error (AHD 1.4 degrees, LINEAR 0.5), but uniform objects
+                # have half the error (0.2, 0.4).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     # Some sensors have four colours. The fourth must not become an alpha channel.
@@ -234,24 +298,31 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
 
 
 def read_shot(path: Path) -> tuple[float, float, float]:
-    """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does not state it.
+    """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does
+    not state it.
 
-    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. Raises InputError.
+    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. Raises
+    InputError.
     """
-    with _libraw(path) as rawpy, native_stderr(), rawpy.imread(io.BytesIO(path.read_bytes())) as raw:
+    with (
+        _libraw(path) as rawpy,
+        native_stderr(),
+        rawpy.imread(io.BytesIO(path.read_bytes())) as raw,
+    ):
         return raw.other.shutter_speed, raw.other.aperture, raw.other.iso_speed
 
 
 def _full_scale(raw: rawpy.RawPy) -> int:
     """Return the value above black from which a photosite is considered saturated."""
     white = raw.white_level
-    # LibRaw gives the largest number. Many sensors saturate below it, and some files state the level. A level far from
-    # the largest number is in another unit.
+    # LibRaw gives the largest number. Many sensors saturate below it, and some files state the
+    # level. A level far from the largest number is in another unit.
     stated = raw.camera_white_level_per_channel
     if stated is not None and white / 2 <= min(stated) <= white:
         white = min(stated)
-    # The black levels of the colours differ a little, and the colour with the highest must reach full scale, too. It is
-    # one less because LibRaw drops decimals after scaling: otherwise every seventh white level would end at 65534.
+    # The black levels of the colours differ a little, and the colour with the highest must reach
+    # full scale, too. It is one less because LibRaw drops decimals after scaling: otherwise every
+    # seventh white level would end at 65534.
     return max(white - max(raw.black_level_per_channel) - 1, 1)
 
 

@@ -1,7 +1,8 @@
-"""The facts of an image file, read from its header in one pass: size, transfer curve, white level and EXIF tags.
+"""The facts of an image file, read from its header in one pass: size, transfer curve, white level
+and EXIF tags.
 
-The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones without end. Pillow reads
-the EXIF tags, and tifffile the tags of TIFF.
+The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones
+without end. Pillow reads the EXIF tags, and tifffile the tags of TIFF.
 """
 
 from __future__ import annotations
@@ -29,18 +30,45 @@ if TYPE_CHECKING:
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP", b"P5": "PGM", b"P6": "PPM"}
-_BRANDS = {b"WEBP": "WEBP", b"avif": "AVIF", b"avis": "AVIF", b"heic": "HEIF", b"heix": "HEIF", b"mif1": "HEIF"}
+_STARTS = {
+    PNG: "PNG",
+    JPEG: "JPEG",
+    **dict.fromkeys(TIFF, "TIFF"),
+    b"BM": "BMP",
+    b"P5": "PGM",
+    b"P6": "PPM",
+}
+_BRANDS = {
+    b"WEBP": "WEBP",
+    b"avif": "AVIF",
+    b"avis": "AVIF",
+    b"heic": "HEIF",
+    b"heix": "HEIF",
+    b"mif1": "HEIF",
+}
 """The first bytes of the files, or the bytes from the ninth on, after a length and RIFF or ftyp."""
 
 PILLOW_KINDS = ("BMP", "TGA", "WEBP", "AVIF", "HEIF")  # kinds of files that Pillow reads, of 8 bits
-_PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")  # width, height and the largest value
-StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as stored, and the bytes of each number
+# width, height and the largest value
+_PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")
+# shape (H, W, C) of an image as stored, and the bytes of each number
+StoredSize = tuple[tuple[int, ...], int]
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
-_KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)  # also of the focal length; see balls.py
-_MOST_PARTS = 10_000  # chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
+# also of the focal length; see balls.py
+_KEPT = (
+    *_EXPOSURE,
+    0x920A,
+    0xA002,
+    0xA20E,
+    0xA210,
+    0xA402,
+    0xA403,
+    0xA405,
+)
+# chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
+_MOST_PARTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -53,8 +81,13 @@ class StatedCurve:
 
 
 _ENCODED = StatedCurve(SRGB, "PNG that says so")
-_CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a film")) | {8: StatedCurve(), 13: _ENCODED}
-"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over all others."""
+_CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a film")) | {
+    8: StatedCurve(),
+    13: _ENCODED,
+}
+"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over
+all others.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,13 +97,16 @@ class ImageHeader:
     path: Path
     kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
-    curve: StatedCurve = StatedCurve()  # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
-    # the white level of a 16-bit image, 2^bits - 1 if the file states bits; None without one. It is in the unit of
-    # the decoded values: full scale for a RAW file, regardless of its tags
+    # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    curve: StatedCurve = StatedCurve()
+    # the white level of a 16-bit image, 2^bits - 1 if the file states bits; None without one. It is
+    # in the unit of the decoded values: full scale for a RAW file, regardless of its tags
     white_level: int | None = None
-    # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
+    # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only
+    # LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is requested
+    # why the file cannot be read. It is raised when the size is requested
+    damage: InputError | None = None
 
     @property
     def stated_channels(self) -> int | None:
@@ -85,7 +121,9 @@ class ImageHeader:
         if self.kind == "RAW":
             return decoders.raw_size(self.path)
         if self.stated_size is None:
-            raise InputError(f"the {self.kind} is truncated", path=self.path, hint=decoders.COPY_AGAIN)
+            raise InputError(
+                f"the {self.kind} is truncated", path=self.path, hint=decoders.COPY_AGAIN
+            )
         return self.stated_size
 
 
@@ -100,7 +138,9 @@ def read_header(path: Path) -> ImageHeader:
 
 @contextmanager
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
-    """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
+    """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises
+    InputError.
+    """
     stored, _ = decoders.page_of(path)
     check_file(stored, "an image")
     with reading(path), stored.open("rb") as file:
@@ -114,7 +154,9 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
             found = _BRANDS.get(start[8:], found)
         kind = "RAW" if suffix in decoders.RAW_SUFFIXES else found
         if kind is None:
-            raise InputError("found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path)
+            raise InputError(
+                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path
+            )
         yield file, kind
 
 
@@ -122,7 +164,8 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
     """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
-        return ImageHeader(path, kind, white_level=65_535, exif=exif)  # of developed RAW files; see decode_raw
+        # of developed RAW files; see decode_raw
+        return ImageHeader(path, kind, white_level=65_535, exif=exif)
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)
@@ -136,12 +179,16 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
         width, height, most, _ = pnm_header(file.read(4096)) or (0, 0, 0, 0)
         shape = (height, width, 1 if kind == "PGM" else 3)
         level = most if 255 < most < 65_535 else None
-        return ImageHeader(path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level)
+        return ImageHeader(
+            path, kind, (shape, 1 if most < 256 else 2) if most else None, white_level=level
+        )
     return {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind](file, path)
 
 
 def pnm_header(start: bytes) -> tuple[int, int, int, int] | None:
-    """Return width, height, largest value and place of the pixels of a PGM or PPM; None for a damaged one."""
+    """Return width, height, largest value and place of the pixels of a PGM or PPM; None for a
+    damaged one.
+    """
     found = _PNM.match(start[:4096])
     return None if found is None else (int(found[1]), int(found[2]), int(found[3]), found.end())
 
@@ -153,7 +200,9 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
 
     if kind == "HEIF":
         otherwise = "export the photographs as 16-bit TIFF or PNG"
-        import_extra("pillow_heif", "heif", error=InputError, path=path, otherwise=otherwise).register_heif_opener()
+        import_extra(
+            "pillow_heif", "heif", error=InputError, path=path, otherwise=otherwise
+        ).register_heif_opener()
     with decoders.damage_as_input_error(path, decoders.DAMAGED), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures, which are checked later
         yield Image.open(file, formats=[kind])
@@ -181,15 +230,27 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
         except zlib.error:
             profile = b""
     # 100000 times the exponent of the encoding: 1 means linear.
-    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (0, 100_000)
+    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (
+        0,
+        100_000,
+    )
     curve = _curve(_ENCODED if encoded else StatedCurve(), profile)
     if b"cICP" in chunks:
-        curve = _CODE_POINTS.get(int.from_bytes(chunks[b"cICP"][1:2], "big"), StatedCurve(unread=True))
+        curve = _CODE_POINTS.get(
+            int.from_bytes(chunks[b"cICP"][1:2], "big"), StatedCurve(unread=True)
+        )
     # One number for each channel. Alpha, if there is one, comes last.
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
-    return ImageHeader(path, "PNG", size, curve, level, _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))))
+    return ImageHeader(
+        path,
+        "PNG",
+        size,
+        curve,
+        level,
+        _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
+    )
 
 
 def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
@@ -212,7 +273,9 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """Yield marker and length of the segments up to a JPEG's frame, with the file at each one's content."""
+    """Yield marker and length of the segments up to a JPEG's frame, with the file at each one's
+    content.
+    """
     start, marker = 2, 0
     for _ in range(_MOST_PARTS):
         file.seek(start)
@@ -239,7 +302,8 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageHeader:
         if tag is not None:
             value = tag.value if tag.count <= LARGEST_PROFILE else b""
             profile = value if isinstance(value, bytes) else b""
-        white, largest = (_one_value(page.tags.valueof(code)) for code in (50717, 281))  # WhiteLevel, MaxSampleValue
+        # WhiteLevel, MaxSampleValue
+        white, largest = (_one_value(page.tags.valueof(code)) for code in (50717, 281))
         has_exif = _EXIF in page.tags or ORIENTATION in page.tags
         place, order, big = page.offset, page.parent.byteorder, page.parent.is_bigtiff
 
@@ -269,7 +333,9 @@ def _level(bits: int) -> int | None:
 
 
 def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
-    """Return the curve of a profile, or the otherwise stated curve if the profile is missing or unreadable."""
+    """Return the curve of a profile, or the otherwise stated curve if the profile is missing or
+    unreadable.
+    """
     if profile is None:
         return stated
     found = profile_curve(profile)
@@ -280,7 +346,9 @@ def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
 
 
 def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
-    """Return the tags that are kept, empty for damaged ones; None for a RAW file of its maker's own format."""
+    """Return the tags that are kept, empty for damaged ones; None for a RAW file of its maker's own
+    format.
+    """
     from PIL import Image
 
     tags, found = Image.Exif(), dict[int, Any]()
@@ -335,20 +403,29 @@ def find_exposure(facts: ImageHeader) -> Exposure | None:
 
 def check_exposures(images: Sequence[ImageHeader]) -> None:
     """Raise InputError if two images state different exposures."""
-    found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
+    found = [
+        (facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None
+    ]
     for facts, exposure in found[1:]:
         first, expected = found[0]
         # Shutters and ISO numbers are rounded.
         if abs(exposure.relative / expected.relative - 1) > 0.1:
-            hint = "Expose all images alike, or give each image's exposure as the intensity of its light"
-            problem = f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
+            hint = (
+                "Expose all images alike, or give each image's exposure as the intensity of its"
+                " light"
+            )
+            problem = (
+                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
+            )
             raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
 
 
 def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] | None:
-    """Return the exposure of each image, relative to their mean, and a sentence about them; None for equal ones.
+    """Return the exposure of each image, relative to their mean, and a sentence about them; None
+    for equal ones.
 
-    Images without a stated exposure are refused beside images with different ones, as in check_exposures.
+    Images without a stated exposure are refused beside images with different ones, as in
+    check_exposures.
     """
     try:
         check_exposures(images)
@@ -358,26 +435,42 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
         if len(found) < len(images):
             raise
     mean = sum(exposure.relative for exposure in found) / len(found)
-    darkest, brightest = (choose(found, key=lambda exposure: exposure.relative) for choose in (min, max))
-    text = f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
+    darkest, brightest = (
+        choose(found, key=lambda exposure: exposure.relative) for choose in (min, max)
+    )
+    text = (
+        f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
+    )
     tags = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
-    automatic = [word for word, tag in tags.items() if any((facts.exif or {}).get(tag) == 0 for facts in images)]
+    automatic = [
+        word
+        for word, tag in tags.items()
+        if any((facts.exif or {}).get(tag) == 0 for facts in images)
+    ]
     if automatic:
-        text += f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
+        text += (
+            f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
+        )
     return [exposure.relative / mean for exposure in found], text
 
 
 def common_orientation(images: Sequence[ImageHeader]) -> int:
     """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT if they state none.
 
-    The orientation of RAW files is ignored: their pixels are read in the sensor's orientation. Raises InputError for
-    two images with different orientations, because their pixels do not correspond.
+    The orientation of RAW files is ignored: their pixels are read in the sensor's orientation.
+    Raises InputError for two images with different orientations, because their pixels do not
+    correspond.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)
     orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
-            problem = f"found EXIF orientation {orientation}, expected {orientations[0]} as in {asked[0].path.name}"
-            raise InputError(problem, path=facts.path, hint="Export all images the same way up, without this tag")
+            problem = (
+                f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
+                f" {asked[0].path.name}"
+            )
+            raise InputError(
+                problem, path=facts.path, hint="Export all images the same way up, without this tag"
+            )
     return orientations[0] if orientations else UPRIGHT

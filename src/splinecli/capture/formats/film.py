@@ -1,6 +1,7 @@
 """Films as captures: a fixed camera films an object while a lamp is carried around it.
 
-Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as different as possible.
+Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as
+different as possible.
 """
 
 from __future__ import annotations
@@ -27,9 +28,18 @@ if TYPE_CHECKING:
 
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
 _CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
-# FFmpeg recognises playlists by their content, and these name other files. So only containers of films are opened.
-_CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
-# A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels.
+# FFmpeg recognises playlists by their content, and these name other files. So only containers of
+# films are opened.
+_CONTAINERS = (
+    (4, b"ftyp"),
+    (4, b"moov"),
+    (4, b"mdat"),
+    (4, b"wide"),
+    (0, b"RIFF"),
+    (0, b"\x1a\x45\xdf\xa3"),
+)
+# A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of
+# clipped pixels.
 _Candidate = tuple[int, Float32Array, float, float]
 
 
@@ -40,26 +50,41 @@ def is_film(path: Path) -> bool:
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
-    """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights differ most.
+    """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights
+    differ most.
 
     Raises InputError if the film cannot be read, or its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
     # Sharpness depends on the light, so only neighbouring frames are compared.
-    around = [np.median(sharpness[max(0, place - 7) : place + 8]) for place in range(len(sharpness))]
+    around = [
+        np.median(sharpness[max(0, place - 7) : place + 8]) for place in range(len(sharpness))
+    ]
     bright = (light >= 0.2 * np.median(light)) & (light > 0)
-    usable = (sharpness >= 0.6 * np.array(around)) & bright & (clipped <= max(0.01, float(np.median(clipped))))
+    usable = (
+        (sharpness >= 0.6 * np.array(around))
+        & bright
+        & (clipped <= max(0.01, float(np.median(clipped))))
+    )
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
-        problem = f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light, expected"
-        hint = "Film from a tripod while the lamp moves all around the object, with focus and exposure locked"
+        problem = (
+            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their"
+            " light, expected"
+        )
+        hint = (
+            "Film from a tripod while the lamp moves all around the object, with focus and"
+            " exposure locked"
+        )
         raise InputError(f"{problem} at least {FEWEST_FRAMES}", path=film, hint=hint)
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-    """Yield frames of rising numbers as stored: (H, W, 3) RGB, usually with the curve BT709. Raises InputError."""
+    """Yield frames of rising numbers as stored: (H, W, 3) RGB, usually with the curve BT709. Raises
+    InputError.
+    """
     with _opened(film) as video:
         place = 0
         for number in numbers:
@@ -73,7 +98,9 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
 
 
 def _candidates(film: Path) -> list[_Candidate]:
-    """Return evenly spaced frames, with the measurements for choosing among them. Raises InputError."""
+    """Return evenly spaced frames, with the measurements for choosing among them. Raises
+    InputError.
+    """
     import cv2
 
     found: list[_Candidate] = []
@@ -101,11 +128,17 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     def reduced(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
         share = side / max(image.shape[:2])
         size = max(1, round(image.shape[1] * share)), max(1, round(image.shape[0] * share))
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) if share < 1 else image
+        return (
+            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            if share < 1
+            else image
+        )
 
     small = reduced(picture, 512)
     gray = small.astype(np.float32).mean(axis=2)
-    sharpness = float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean() / max(float(gray.mean()), 1e-3))
+    sharpness = float(
+        np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean() / max(float(gray.mean()), 1e-3)
+    )
     clipped = float((small.max(axis=2) >= 250).mean())
     stored = np.asarray(reduced(small, 64) / 255, np.float32)
     linear = np.asarray(decode_transfer(stored, BT709).mean(axis=2), np.float32)
@@ -113,7 +146,8 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
 
 
 def _farthest(thumbnails: Float32Array) -> list[int]:
-    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is ignored.
+    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is
+    ignored.
 
     Unit vectors closer than 0.05 are considered to have the same light.
     """
@@ -140,16 +174,25 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
     with damage_as_input_error(film, problem, hint), film.open("rb") as file:
         start = file.read(16)
         if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files are read as films")
+            raise InputError(
+                "found no film",
+                path=film,
+                hint="MP4, MOV, AVI, MKV and WebM files are read as films",
+            )
         file.seek(0)
-        # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first film.
+        # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first
+        # film.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
         with native_stderr():
             video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
         try:
             if not video.isOpened():
                 raise ValueError
-            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+            size = (
+                int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+                int(video.get(cv2.CAP_PROP_FRAME_WIDTH)),
+                3,
+            )
             check_stored_size(size, 1, film)
             yield video
         finally:

@@ -1,11 +1,13 @@
-"""Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear values, and as masks.
+"""Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear
+values, and as masks.
 
-The sizes of images and the memory of captures are checked only here, with the same messages everywhere. The check uses
-the header, before anything is decoded: a file of a few kilobytes may state gigabytes of pixels, by mistake or by
-intent.
+The sizes of images and the memory of captures are checked only here, with the same messages
+everywhere. The check uses the header, before anything is decoded: a file of a few kilobytes may
+state gigabytes of pixels, by mistake or by intent.
 
-Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the
-container is checked before it is decoded, and the messages of the C libraries are caught and searched.
+Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only
+prints to stderr. So the container is checked before it is decoded, and the messages of the C
+libraries are caught and searched.
 """
 
 import math
@@ -35,23 +37,35 @@ class ExpectedSize:
     what: str = "an image"  # description of the image, with its article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
-        """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or width."""
+        """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or
+        width.
+        """
         if found[:2] != self.shape[:2]:
-            problem = f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}"
+            problem = (
+                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in"
+                f" {self.like}"
+            )
             raise InputError(problem, path=path)
 
 
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
+    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to
+    be read.
+    """
     if expected is not None:
         expected.check(shape, path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels"
-        raise InputError(problem, path=path, hint="If the size is right, use a smaller copy of the image")
+        problem = (
+            f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g}"
+            " megapixels"
+        )
+        raise InputError(
+            problem, path=path, hint="If the size is right, use a smaller copy of the image"
+        )
     check_memory(n_bytes, takes, path)
 
 
@@ -71,7 +85,9 @@ def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = Non
     """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
-        problem = f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available"
+        problem = (
+            f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available"
+        )
         raise InputError(problem, path=path, hint=hint)
 
 
@@ -82,7 +98,8 @@ def _size(shape: tuple[int, ...]) -> str:
 def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
     """Return the size of the largest of some images.
 
-    Raises InputError if one has another height or width than the first, is too large, or has an incomplete header.
+    Raises InputError if one has another height or width than the first, is too large, or has an
+    incomplete header.
     """
     first = images[0]
     check_stored_size(*first.size, first.path)
@@ -94,29 +111,37 @@ def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
     return max((image.size for image in asked), key=lambda size: image_bytes(*size))
 
 
-# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
+# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else
+# ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 # Messages of libpng and libjpeg about pixels that they could not read.
-_DAMAGE = re.compile(r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE)
+_DAMAGE = re.compile(
+    r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
+)
 
 
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
-    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
-    and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
-    EXIF orientation is ignored, because all images of a capture share one pixel grid. The header is compared with the
-    expected size.
+    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or
+    255). PNG, JPEG and TIFF files are recognised by their content. RAW files are recognised by name
+    and developed (see decode_raw). An EXIF orientation is ignored, because all images of a capture
+    share one pixel grid. The header is compared with the expected size.
 
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
-            image does not have the expected size, or is too large (see check_stored_size).
+        InputError: the file is missing, of another format, truncated or damaged, or a RAW file
+            without rawpy; or the image does not have the expected size, or is too large (see
+            check_stored_size).
     """
     return decode_with_alpha(path, expected)[0]
 
 
-def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[Array, Array | None]:
-    """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
+def decode_with_alpha(
+    path: Path, expected: ExpectedSize | None = None
+) -> tuple[Array, Array | None]:
+    """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises
+    InputError.
+    """
     damage = decoders.damage_as_input_error(path, decoders.DAMAGED, decoders.COPY_AGAIN)
     with damage, facts.open_image(path) as (file, kind):
         size = facts.facts_in(file, kind, path).size
@@ -124,7 +149,10 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
         # It is read as a whole, with 64 MB for previews and colour profiles.
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
         if length > most:
-            problem = f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size"
+            problem = (
+                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image"
+                " of this size"
+            )
             raise InputError(problem, path=path)
         file.seek(0)
         pixels = _decode(file, kind, path)
@@ -133,7 +161,9 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] not in (1, 2, 3, 4):
-        raise InputError(f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path)
+        raise InputError(
+            f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path
+        )
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
@@ -170,12 +200,15 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
 
 
 def _decode_with_opencv(data: bytes, page: int) -> Array:
-    """Return a page's pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error for a damaged file."""
+    """Return a page's pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error
+    for a damaged file.
+    """
     import cv2
 
     with decoders.native_stderr() as messages:
         try:
-            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
+            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation
+            # alone.
             content, pixels = np.frombuffer(data, np.uint8), None
             if page:
                 _, found = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
@@ -192,7 +225,8 @@ def _decode_with_opencv(data: bytes, page: int) -> Array:
         return pixels
     if pixels.dtype in (np.uint8, np.uint16, np.float32):
         code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-        return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))  # in place, and far faster than an index
+        # in place, and far faster than an index
+        return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
@@ -207,7 +241,9 @@ def _check_png(data: bytes, path: Path) -> None:
         if end > len(data):
             break
         if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint=decoders.COPY_AGAIN)
+            raise InputError(
+                "the PNG is damaged (a checksum is wrong)", path=path, hint=decoders.COPY_AGAIN
+            )
         if data[body : body + 4] == b"IEND":
             return
         position = end
@@ -215,7 +251,9 @@ def _check_png(data: bytes, path: Path) -> None:
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
-    """Raise InputError unless there is an end-of-image marker; a second picture after it is ignored."""
+    """Raise InputError unless there is an end-of-image marker; a second picture after it is
+    ignored.
+    """
     position = 2
     while position + 2 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -234,13 +272,15 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
-    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be linear.
+    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be
+    linear.
 
-    The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
-    are kept. Alpha is dropped, and an EXIF orientation is ignored.
+    The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1.
+    Floating-point values are kept. Alpha is dropped, and an EXIF orientation is ignored.
 
     Raises:
-        InputError: see decode_image; also for floating-point values that are negative or not finite.
+        InputError: see decode_image; also for floating-point values that are negative or not
+            finite.
     """
     return to_linear(decode_image(Path(path), expected), Path(path))
 
@@ -255,21 +295,27 @@ def to_linear(stored: Array, path: Path) -> Float32Array:
     if stored.dtype.kind == "u":
         values /= np.float32(np.iinfo(stored.dtype).max)
         return values
-    # One of these is NaN or infinite where any value is. np.isfinite of all values would need another array.
+    # One of these is NaN or infinite where any value is. np.isfinite of all values would need
+    # another array.
     lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if not (np.isfinite(lowest) and np.isfinite(highest)):
-        raise InputError("found a value that is not finite (NaN or infinity), expected a photograph", path=path)
+        raise InputError(
+            "found a value that is not finite (NaN or infinity), expected a photograph", path=path
+        )
     if lowest < 0:
         hint = "Set values below zero, such as noise after a dark frame was subtracted, to zero"
-        raise InputError(f"found the negative value {lowest:g}, expected a photograph", path=path, hint=hint)
+        raise InputError(
+            f"found the negative value {lowest:g}, expected a photograph", path=path, hint=hint
+        )
     return values
 
 
 def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
-    So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the mask, because
-    colours mean nothing in such an image. Raises InputError if the image cannot be read, or no pixel is above zero.
+    So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the
+    mask, because colours mean nothing in such an image. Raises InputError if the image cannot be
+    read, or no pixel is above zero.
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path, expected)
@@ -284,9 +330,11 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
 
 
 def cut_out(alpha: Array | None) -> Bools | None:
-    """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
+    """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one
+    that does not.
 
-    A pixel is opaque above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
+    A pixel is opaque above half of the largest alpha. A channel that is opaque everywhere or
+    nowhere cuts nothing out.
     """
     opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)
     return opaque if opaque is not None and opaque.any() and not opaque.all() else None

@@ -1,13 +1,16 @@
-"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, for example from scanners.
+"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, for example
+from scanners.
 
 Frame: x right, y up, z to the camera. A file is one of
 
-- MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array; and .npy. Unsigned integers are a picture;
+- MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array; and .npy. Unsigned integers
+  are a picture;
 - .txt: H*W rows of x y z in row-major order, for ground truth only;
-- a picture: n = 2 v / full scale - 1, black or mid-gray without a normal; a floating-point TIFF contains n itself.
+- a picture: n = 2 v / full scale - 1, black or mid-gray without a normal; a floating-point TIFF
+  contains n itself.
 
-Vectors are scaled to unit length. Zero and non-finite vectors are not normals. Depth maps are floating-point .npy, TIFF
-and OpenEXR files.
+Vectors are scaled to unit length. Zero and non-finite vectors are not normals. Depth maps are
+floating-point .npy, TIFF and OpenEXR files.
 """
 
 import io
@@ -42,14 +45,16 @@ class _Stored(NamedTuple):
 def read_normal_map(
     path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl"
 ) -> Float32Array:
-    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a normal.
+    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a
+    normal.
 
-    Raises InputError if the file cannot be read, contains no normal map, or is not of the mask's size.
+    Raises InputError if the file cannot be read, contains no normal map, or is not of the mask's
+    size.
 
     Args:
         path: any of the files above but text.
-        mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
-            something out, that is left out, too.
+        mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's
+            alpha channel cuts something out, that is left out, too.
         convention: whether green is y up or y down in a picture.
     """
     path = Path(path)
@@ -74,9 +79,10 @@ def read_normal_map(
 def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
-    Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text files are flipped
-    vertically if they then fill the mask clearly better, like the normal.txt of DiLiGenT's Harvest. Raises InputError
-    if the file cannot be read, has another size, or has no normal inside the mask.
+    Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text
+    files are flipped vertically if they then fill the mask clearly better, like the normal.txt of
+    DiLiGenT's Harvest. Raises InputError if the file cannot be read, has another size, or has no
+    normal inside the mask.
 
     Args:
         path: any of the files above; pictures as PNG or TIFF.
@@ -85,28 +91,40 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp"):
-        problem = f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or .bmp'
+        problem = (
+            f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or'
+            " .bmp"
+        )
         raise InputError(problem, path=path)
     if suffix != ".txt":
-        stored = _read_vectors(path, images.ExpectedSize(mask.shape, "the images", "a ground truth"))
+        stored = _read_vectors(
+            path, images.ExpectedSize(mask.shape, "the images", "a ground truth")
+        )
         return _to_normals(stored, mask, path), False
     values = _read_text(path, *mask.shape)
     filled = (values != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
     upside_down = bool(turned - as_stored > 0.02 * np.count_nonzero(mask))
-    return _to_normals(_Stored(values[::-1] if upside_down else values, None, False), mask, path), upside_down
+    return _to_normals(
+        _Stored(values[::-1] if upside_down else values, None, False), mask, path
+    ), upside_down
 
 
 def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
-    """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError."""
+    """Return the vectors of a file of normals. Its size is compared before its values are read.
+    Raises InputError.
+    """
     check_file(path, "a normal map")
     suffix, alpha = path.suffix.lower(), None
     if suffix == ".mat":
         with damage_as_input_error(path, "the MATLAB file is damaged and cannot be read"):
             values = read_mat(path, expected)
     elif suffix == ".npy":
-        with damage_as_input_error(path, "the .npy file is damaged, or contains no array of numbers"):
-            # A map of the file, which reads the header alone. It rejects a file that is shorter than its header states.
+        with damage_as_input_error(
+            path, "the .npy file is damaged, or contains no array of numbers"
+        ):
+            # A map of the file, which reads the header alone. It rejects a file that is shorter
+            # than its header states.
             array = np.lib.format.open_memmap(path, mode="r")
             images.check_vectors(array.shape, path)
             images.check_stored_size(array.shape, array.dtype.itemsize, path, expected)
@@ -119,7 +137,8 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
 
 def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
-    most = 3 * height * width * 32 + MOST_TEXT  # characters of a number, with the separator after it
+    # characters of a number, with the separator after it
+    most = 3 * height * width * 32 + MOST_TEXT
     check_length(path, most, "a normal map")
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
@@ -127,13 +146,18 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
         # This reader is slower, but it reads commas and names the line of an error.
         rows = read_number_rows(path, most=most).as_array()
     if rows.shape != (height * width, 3):
-        problem = f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {height * width} rows of 3,"
+        problem = (
+            f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {height * width} rows of 3,"
+        )
         raise InputError(f"{problem} one for each pixel of {height} x {width}", path=path)
     return rows.reshape(height, width, 3)
 
 
-def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False) -> Float32Array:
-    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are not normals.
+def _to_normals(
+    stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False
+) -> Float32Array:
+    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values
+    that are not normals.
 
     With check_floats, floating-point values must have about unit length, too, as colours must.
     """
@@ -150,14 +174,18 @@ def _to_normals(stored: _Stored, mask: Bools, path: Path, *, check_floats: bool 
             normals[block] = decode_picture(values[block])
         else:
             vectors = values[block].astype(np.float64)
-            normals[block] = unit(np.where((np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True), vectors, 0))
+            normals[block] = unit(
+                np.where((np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True), vectors, 0)
+            )
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
     return normals
 
 
 def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
-    """Raise InputError for colours or vectors (H, W, 3) that are not directions, such as a photograph's colours."""
+    """Raise InputError for colours or vectors (H, W, 3) that are not directions, such as a
+    photograph's colours.
+    """
     vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float64)
     if stored.dtype.kind == "u":
         vectors = vectors * (2 / np.iinfo(stored.dtype).max) - 1
@@ -166,10 +194,14 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
     if not usable.any():
         return
-    # Unit vectors may have gone through 8 bits, resizing or JPEG. In photographs, a third has unit length by chance.
+    # Unit vectors may have gone through 8 bits, resizing or JPEG. In photographs, a third has unit
+    # length by chance.
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
-        problem = f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 - 1), expected"
+        problem = (
+            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2"
+            " - 1), expected"
+        )
         hint = "If the background is not black, give a mask"
         raise InputError(f"{problem} nearly all: these are not normals", path=path, hint=hint)
 
@@ -178,7 +210,8 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
     """Return a depth map (H, W) float64, NaN where it is not finite because the depth is unknown.
 
     Raises:
-        InputError: the file cannot be read, is not a map of floating-point numbers, or has another size.
+        InputError: the file cannot be read, is not a map of floating-point numbers, or has another
+            size.
         UsageError: the file is an EXR file, and OpenEXR is not installed.
     """
     check_file(path, "a depth map")
@@ -194,7 +227,9 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
     if stored.ndim != 2 or stored.dtype.kind != "f":
         found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
         problem = f"found an array of {found}, expected floating-point numbers H x W"
-        raise InputError(problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR")
+        raise InputError(
+            problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR"
+        )
     depth = np.array(stored, np.float64)
     depth[~np.isfinite(depth)] = np.nan
     return depth
@@ -209,12 +244,22 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
             low, high = library.File(name, header_only=True).header()["dataWindow"]
         shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
         images.check_stored_size(shape, 4, path, expected)
-        # For damaged pixels, the library only prints a warning, and stdout is reserved for the product of a command.
+        # For damaged pixels, the library only prints a warning, and stdout is reserved for the
+        # product of a command.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path=path)
-    for name in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):  # names of a depth, then any other
+    for name in (
+        "Z",
+        "Y",
+        "R",
+        "V",
+        "depth.Z",
+        "RGB",
+        "RGBA",
+        *channels,
+    ):  # names of a depth, then any other
         if name in channels:
             return np.asarray(channels[name].pixels)
     raise InputError("the EXR file has no channel", path=path)

@@ -1,7 +1,8 @@
-"""Numbers in text files, with any separator, byte order marks, comments and blank lines, and in MATLAB's .mat files of
-version 5, 6 and 7 (MathWorks, "MAT-File Format").
+"""Numbers in text files, with any separator, byte order marks, comments and blank lines, and in
+MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File Format").
 
-We have our own .mat reader, only for arrays of real numbers, because SciPy's ends the process at unknown types.
+We have our own .mat reader, only for arrays of real numbers, because SciPy's ends the process at
+unknown types.
 """
 
 import codecs
@@ -30,16 +31,22 @@ _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 
 _FROM_PIPES: dict[Path, bytes] = {}
 
-WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
+# one-based line of a row in its file, this line without comments, and its words
+WordRow = tuple[int, str, list[str]]
 
 MOST_TEXT = 1_000_000
-"""Bytes of the longest text file that is read, unless the number of images sets the limit: 14,000 lights."""
+"""Bytes of the longest text file that is read, unless the number of images sets the limit: 14,000
+lights.
+"""
 
-DECIMAL_POINT = "A comma separates columns; write decimals with a point"  # hint for a line with decimal commas
+# hint for a line with decimal commas
+DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 
 class Row(NamedTuple):
-    """A row of numbers, its one-based line in the file, and this line as written, without comments."""
+    """A row of numbers, its one-based line in the file, and this line as written,
+    without comments.
+    """
 
     numbers: tuple[float, ...]
     line: int | None  # None in a file without lines, such as JSON
@@ -52,12 +59,16 @@ class NumberRows:
 
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
-    names: tuple[str, ...] | None = None  # of each row's image, without folders; None if rows begin with numbers
+    # of each row's image, without folders; None if rows begin with numbers
+    names: tuple[str, ...] | None = None
     intensities: Float64Array | None = None  # (R, 3), RGB, of the lights of a file that has them
-    are_vectors: bool = False  # whether each row is a vector x y z, because the format has nothing else
+    # whether each row is a vector x y z, because the format has nothing else
+    are_vectors: bool = False
 
     def as_array(self) -> Float64Array:
-        """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
+        """Return the rows as (R, C) float64. Raises InputError at the first row that differs in
+        length.
+        """
         lengths = [len(row.numbers) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
         for (_, line, text), length in zip(self.rows, lengths, strict=True):
@@ -75,23 +86,32 @@ def columns(count: int) -> str:
 
 def has_decimal_commas(text: str) -> bool:
     """Return whether a line looks like numbers with decimal commas, such as "0,5 0,3 0,8"."""
-    return "." not in text and re.search(r"\d,\d", text) is not None and re.search(r"[\s;]", text) is not None
+    return (
+        "." not in text
+        and re.search(r"\d,\d", text) is not None
+        and re.search(r"[\s;]", text) is not None
+    )
 
 
 def check_length(path: Path, most: int, expected: str = "a text file") -> None:
-    """Raise InputError for a text file of more than `most` bytes, or for something that is not a file."""
+    """Raise InputError for a text file of more than `most` bytes, or for something that is not a
+    file.
+    """
     check_file(path, expected)
     length = path.stat().st_size
     if length > most:
-        problem = f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB"
+        problem = (
+            f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB"
+        )
         raise InputError(problem, path=path)
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
-    """Return the bytes of a text file, or of a pipe instead: the shell's `<(...)`, which can be read only once.
+    """Return the bytes of a text file, or of a pipe instead: the shell's `<(...)`, which can be
+    read only once.
 
-    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages name `expected` as the
-    expected content.
+    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages name
+    `expected` as the expected content.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
@@ -103,7 +123,9 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
                 content = pipe.read(most + 1)
             if len(content) > most:
                 size = f"{most / 1e6:.1f} MB"
-                raise InputError(f"found more than {size}, expected a text file of at most {size}", path=path)
+                raise InputError(
+                    f"found more than {size}, expected a text file of at most {size}", path=path
+                )
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
 
@@ -111,10 +133,11 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
 def read_lines(
     path: Path, *, else_latin_1: bool = False, expected: str = "a text file", most: int = MOST_TEXT
 ) -> list[str]:
-    """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one. Raises InputError.
+    """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one.
+    Raises InputError.
 
-    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows write. For the other
-    arguments, see read_text.
+    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows
+    write. For the other arguments, see read_text.
     """
     content = read_text(path, most=most, expected=expected)
     is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -133,17 +156,23 @@ def read_lines(
     return lines
 
 
-def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
-    """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
+def read_number_rows(
+    path: Path, *, expected: str = "a text file", most: int = MOST_TEXT
+) -> NumberRows:
+    """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines
+    are skipped.
 
-    For the arguments, see read_text. Raises InputError with the line for a word that is not a finite number; also for a
-    file without numbers.
+    For the arguments, see read_text. Raises InputError with the line for a word that is not a
+    finite number; also for a file without numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
 
-def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT) -> list[WordRow]:
-    """Return the words of each line that has any, with points for decimal commas. Raises InputError.
+def read_rows_of_words(
+    path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT
+) -> list[WordRow]:
+    """Return the words of each line that has any, with points for decimal commas. Raises
+    InputError.
 
     A line ends with n_numbers numbers. See read_text for the other arguments.
     """
@@ -158,10 +187,15 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
 
 
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
-    """Return the numbers of rows of words. Raises InputError with the line for other words, and for no rows."""
+    """Return the numbers of rows of words. Raises InputError with the line for other words, and for
+    no rows.
+    """
     if not rows:
         raise InputError("the file contains no numbers", path=path)
-    parsed = (Row(tuple(parse_number(word, path, line) for word in words), line, text) for line, text, words in rows)
+    parsed = (
+        Row(tuple(parse_number(word, path, line) for word in words), line, text)
+        for line, text, words in rows
+    )
     return NumberRows(path, tuple(parsed))
 
 
@@ -171,11 +205,15 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
     words = [word for word in separators.split(text) if word]
     if not decimal_commas:
         return words
-    return [word.replace(",", ".") if _NUMBER_WITH_COMMA.fullmatch(word) else word for word in words]
+    return [
+        word.replace(",", ".") if _NUMBER_WITH_COMMA.fullmatch(word) else word for word in words
+    ]
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
-    """Return whether the last numbers of lines have decimal commas and other separators, as in "0,5 0,3 0,8"."""
+    """Return whether the last numbers of lines have decimal commas and other separators, as in "0,5
+    0,3 0,8".
+    """
     tails = [_SEPARATORS_BESIDE_COMMAS.split(text)[-n_numbers:] for text in texts]
     is_match = _NUMBER_WITH_COMMA.fullmatch
     rows = [words for words in tails if len(words) == n_numbers and any(map(is_match, words))]
@@ -193,7 +231,9 @@ def to_number(word: str) -> float | None:
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """Return the finite number that a word of a text file represents. Raises InputError with the line."""
+    """Return the finite number that a word of a text file represents. Raises InputError with the
+    line.
+    """
     value = to_number(word)
     if value is None or not np.isfinite(value):
         what = "a number" if value is None else "a finite number"
@@ -203,14 +243,27 @@ def parse_number(word: str, path: Path, line: int) -> float:
 
 _TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
-"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them: a double may be stored
-as bytes."""
+"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them: a
+double may be stored as bytes."""
 
 
 class _Variable(NamedTuple):
-    """A numeric variable of a file: its name, shape and type, and the place, length and byte order of its element."""
+    """A numeric variable of a file: its name, shape and type, and the place, length and byte order
+    of its element.
+    """
 
     name: str
     shape: tuple[int, ...]
@@ -222,7 +275,8 @@ class _Variable(NamedTuple):
 
 
 def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
-    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type that it has in MATLAB.
+    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type that it
+    has in MATLAB.
 
     Sizes are checked before anything is read or expanded.
 
@@ -236,7 +290,10 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
         if variable is None:
             maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
             if len(maps) != 1:
-                problem = f"found no Normal_gt, and of other H x W x 3 arrays {', '.join(maps) or 'none'}, expected one"
+                problem = (
+                    "found no Normal_gt, and of other H x W x 3 arrays"
+                    f" {', '.join(maps) or 'none'}, expected one"
+                )
                 raise InputError(problem, path=path)
             (variable,) = maps.values()
         check_vectors(variable.shape, path)
@@ -246,7 +303,10 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
 
 def read_matrices(path: Path) -> dict[str, Array]:
     """Return the numeric matrices of a small file by name. Raises InputError."""
-    with damage_as_input_error(path, "the .mat file is damaged", "Save it again"), path.open("rb") as file:
+    with (
+        damage_as_input_error(path, "the .mat file is damaged", "Save it again"),
+        path.open("rb") as file,
+    ):
         return {
             v.name: _numbers(file, v)
             for v in list(_variables(file, path))
@@ -281,7 +341,9 @@ def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
                 shape, name = next(parts)[1], next(parts)[1]
                 sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
                 dtype = _CLASSES[flags & 0xFF]
-                yield _Variable(bytes(name).decode("latin-1"), sizes, dtype, order, start, length, compressed)
+                yield _Variable(
+                    bytes(name).decode("latin-1"), sizes, dtype, order, start, length, compressed
+                )
         file.seek(start + length)
     raise ValueError("the file has too many elements")
 
@@ -296,7 +358,9 @@ def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: boo
 
 
 def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield the type and bytes of each part of a matrix: flags, sizes, name, numbers. Parts are padded to 8 bytes."""
+    """Yield the type and bytes of each part of a matrix: flags, sizes, name, numbers. Parts are
+    padded to 8 bytes.
+    """
     place = 0
     while place + _TAG_BYTES <= len(content):
         kind, length = struct.unpack_from(order + "II", content, place)

@@ -1,6 +1,8 @@
-"""IA14: the inverse of image formation, with n.l as a monotone polynomial of the observation and of l.v.
+"""IA14: the inverse of image formation, with n.l as a monotone polynomial of the observation and of
+l.v.
 
-Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic surfaces, CVPR 2014.
+Ikehata and Aizawa, Photometric stereo using constrained bivariate regression for general isotropic
+surfaces, CVPR 2014.
 """
 
 from math import comb
@@ -14,34 +16,47 @@ DEGREE_OBSERVATION, DEGREE_LIGHT = 2, 4  # N1 and N2 in the paper
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
-def solve_ia14(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3); see fit."""
+def solve_ia14(
+    observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
+) -> Tensor:
+    """Return normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3);
+    see fit.
+    """
     return fit(observations, light_directions, valid)[0]
 
 
 def fit(
-    observations: Tensor, light_directions: Tensor, valid: Tensor | None = None, *, prior_weight: float = 0.01
+    observations: Tensor,
+    light_directions: Tensor,
+    valid: Tensor | None = None,
+    *,
+    prior_weight: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
-    """Return normals (P, 3) of any length, and the polynomial's increments (P, N1, N2 + 1), which are not negative.
+    """Return normals (P, 3) of any length, and the polynomial's increments (P, N1, N2 + 1), which
+    are not negative.
 
-    Minimises sum_j (n.l_j - g(I_j, l_j.v))^2 + prior_weight * (variance of the increments) over n and g, where
+    Minimises sum_j (n.l_j - g(I_j, l_j.v))^2 + prior_weight * (variance of the increments) over n
+    and g, where
 
-        g(x, y) = sum_ik c_ik B_i(x) B_k(y),   c_0k = 0,   c_ik = c_(i-1)k + d_ik / (N1 * mean I),   d_ik >= 0,
+        g(x, y) = sum_ik c_ik B_i(x) B_k(y),   c_0k = 0,   c_ik = c_(i-1)k + d_ik / (N1 * mean I),
+        d_ik >= 0,
 
-    with B the Bernstein polynomials of degree N1 = 2 in the observation and N2 = 4 in l.v. So g is zero without light
-    and does not decrease as the observation grows.
+    with B the Bernstein polynomials of degree N1 = 2 in the observation and N2 = 4 in l.v. So g is
+    zero without light and does not decrease as the observation grows.
 
-    The length of n is free, so n = 0, g = 0 would be a solution. To exclude it, the mean of g over the used lights is
-    set to 1. This condition is linear, so the programme stays convex. It does not depend on n, so it does not prefer
-    any direction, whereas n_z = 1 would prefer the view direction. It also constrains g at the observed data.
+    The length of n is free, so n = 0, g = 0 would be a solution. To exclude it, the mean of g over
+    the used lights is set to 1. This condition is linear, so the programme stays convex. It does
+    not depend on n, so it does not prefer any direction, whereas n_z = 1 would prefer the view
+    direction. It also constrains g at the observed data.
 
-    The prior is not from the paper. Ten lights do not determine the 13 unknowns. Among all g that fit, the prior
-    selects the one nearest to Lambert's law, for which all increments are equal. With 96 lights it hardly matters. The
-    condition on the mean of g and the scale of the threshold are not from the paper either. A variance of 1 costs as
-    much as a residual of sqrt(prior_weight) times the mean shading.
+    The prior is not from the paper. Ten lights do not determine the 13 unknowns. Among all g that
+    fit, the prior selects the one nearest to Lambert's law, for which all increments are equal.
+    With 96 lights it hardly matters. The condition on the mean of g and the scale of the threshold
+    are not from the paper either. A variance of 1 costs as much as a residual of sqrt(prior_weight)
+    times the mean shading.
 
-    The observations (P, F) are at most 1, under unit light directions (F, 3) or (P, F, 3); `valid` (P, F) is true by
-    default.
+    The observations (P, F) are at most 1, under unit light directions (F, 3) or (P, F, 3); `valid`
+    (P, F) is true by default.
     """
     intensities, lights = observations.double(), light_directions.double()
     if valid is not None:
@@ -58,8 +73,9 @@ def fit(
     size = basis.shape[-1]
     eye = torch.eye(size, dtype=lights.dtype, device=lights.device)
     mean = basis.sum(dim=1) / used.sum(dim=1, keepdim=True).clamp(min=1)
-    # The sum is homogeneous of degree 2 in d, apart from the condition mean'd = 1. Adding (mean'd - 1)^2 to the sum
-    # instead of the condition changes the length of the optimum but not its direction.
+    # The sum is homogeneous of degree 2 in d, apart from the condition mean'd = 1. Adding (mean'd -
+    # 1)^2 to the sum instead of the condition changes the length of the optimum but not its
+    # direction.
     prior = prior_weight / size * (eye - 1 / size)
     hessian = residual.mT @ residual + prior + _RIDGE * eye + mean[:, :, None] * mean[:, None, :]
     increments = minimise_nonnegative(hessian, mean)
@@ -72,31 +88,39 @@ def fit(
 
 
 def _increment_basis(intensities: Tensor, cosines: Tensor) -> Tensor:
-    """Return the contribution of each increment to g (P, F, N1 * (N2 + 1)), for intensities (P, F), zero where unused.
+    """Return the contribution of each increment to g (P, F, N1 * (N2 + 1)), for intensities (P, F),
+    zero where unused.
 
-    If all increments are 1, g is the intensity divided by its mean: sum_i i B_i(x) = N1 x, and sum_k B_k(y) = 1.
+    If all increments are 1, g is the intensity divided by its mean: sum_i i B_i(x) = N1 x, and
+    sum_k B_k(y) = 1.
     """
     steps = _bernstein(intensities, DEGREE_OBSERVATION)[..., 1:]
     # The increment d_ik is part of c_ik, c_(i+1)k, ...
     steps = steps.flip(-1).cumsum(-1).flip(-1)
     mean = intensities.sum(dim=1) / (intensities > 0).sum(dim=1).clamp(min=1)
     steps = steps / (DEGREE_OBSERVATION * torch.where(mean > 0, mean, 1)[:, None, None])
-    return (steps[..., None] * _bernstein(cosines.clamp(0, 1), DEGREE_LIGHT)[..., None, :]).flatten(2)
+    return (steps[..., None] * _bernstein(cosines.clamp(0, 1), DEGREE_LIGHT)[..., None, :]).flatten(
+        2
+    )
 
 
 def _bernstein(values: Tensor, degree: int) -> Tensor:
-    """Return the polynomials comb(degree, i) x^i (1 - x)^(degree - i) in a new last dimension, for x in [0, 1]."""
+    """Return the polynomials comb(degree, i) x^i (1 - x)^(degree - i) in a new last dimension, for
+    x in [0, 1].
+    """
     terms = [comb(degree, i) * values**i * (1 - values) ** (degree - i) for i in range(degree + 1)]
     return torch.stack(terms, dim=-1)
 
 
 def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
-    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for positive definite hessians H (P, K, K) and q (P, K).
+    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for positive definite hessians H (P,
+    K, K) and q (P, K).
 
-    Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM J. Sci. Comput.,
-    algorithm 2): guess which variables are free, solve for them with the others at zero, and exchange those that
-    violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum. They may cause cycles
-    if a hessian is nearly singular; the result is then feasible and close to the optimum.
+    Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM
+    J. Sci. Comput., algorithm 2): guess which variables are free, solve for them with the others at
+    zero, and exchange those that violate x >= 0 or the sign of the gradient. Without rounding
+    errors, this ends at the optimum. They may cause cycles if a hessian is nearly singular; the
+    result is then feasible and close to the optimum.
     """
     count, size = linear.shape
     eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)
@@ -112,14 +136,17 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
         x = torch.cholesky_solve(right_side, torch.linalg.cholesky(system))[..., 0]
         gradient = (hessian @ x[..., None])[..., 0] - linear
         value = torch.where(free, x, gradient)
-        scale = torch.where(free, x.abs().amax(dim=1, keepdim=True), linear.abs().amax(dim=1, keepdim=True))
+        scale = torch.where(
+            free, x.abs().amax(dim=1, keepdim=True), linear.abs().amax(dim=1, keepdim=True)
+        )
         wrong = value < -tolerance * scale
         found[left] = torch.where(free, x, 0)
         wrong_count = wrong.sum(dim=1)
         fewer = wrong_count < fewest_wrong
         fewest_wrong = torch.where(fewer, wrong_count, fewest_wrong)
         patience = torch.where(fewer, 3, patience - 1)
-        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last, which cannot.
+        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the
+        # last, which cannot.
         last = torch.where(wrong, position, -1).amax(dim=1, keepdim=True)
         free = free ^ torch.where(patience[:, None] < 0, wrong & (position == last), wrong)
         rest = torch.nonzero(wrong_count)[:, 0]  # most pixels are done after a few steps

@@ -1,18 +1,19 @@
 """Weighted least squares in torch, pixel by pixel, and the methods that repeat it.
 
-Robust Lambertian fit, the starting point of the networks: iteratively reweighted least squares of I = l . b with two
-weights. Observations below 5 % of the pixel's largest are treated as shadows and get a tiny weight. Large residuals get
-smaller weights, which approximates an L1 fit.
+Robust Lambertian fit, the starting point of the networks: iteratively reweighted least squares of I
+= l . b with two weights. Observations below 5 % of the pixel's largest are treated as shadows and
+get a tiny weight. Large residuals get smaller weights, which approximates an L1 fit.
 
-Two halves of the lights: random errors differ from light to light, so the halves disagree about them. Anything that all
-lights agree on is either right, or wrong in the same way for all pixels of a neighbourhood.
+Two halves of the lights: random errors differ from light to light, so the halves disagree about
+them. Anything that all lights agree on is either right, or wrong in the same way for all pixels of
+a neighbourhood.
 
-L1 minimises the sum of absolute residuals, which shadows and highlights affect less than the sum of squares. Trimmed LS
-leaves out shadows, and the darkest and brightest observations.
+L1 minimises the sum of absolute residuals, which shadows and highlights affect less than the sum of
+squares. Trimmed LS leaves out shadows, and the darkest and brightest observations.
 
-IW12, robust photometric stereo by sparse Bayesian learning: S. Ikehata, D. Wipf, Y. Matsushita, K. Aizawa, "Robust
-photometric stereo using sparse regression", CVPR 2012, section 3.2, with lambda = 0, as in the authors' own
-comparisons.
+IW12, robust photometric stereo by sparse Bayesian learning: S. Ikehata, D. Wipf, Y. Matsushita, K.
+Aizawa, "Robust photometric stereo using sparse regression", CVPR 2012, section 3.2, with lambda =
+0, as in the authors' own comparisons.
 """
 
 import math
@@ -24,16 +25,20 @@ from torch import Tensor
 from splinecli.maths.observation_map import dot
 from splinecli.maths.robust import SHADOW_SHARE, SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
 
-# The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
-# observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
-# a metal all others are dark compared with the highlight.
+# The quantile of a pixel's observations that serves as the reference for its shadows. More than
+# half of the observations may be shadows, and more than a third highlights. The largest observation
+# is a poor reference, because on a metal all others are dark compared with the highlight.
 UNSHADED = 0.6
 
 
-def lit_observations(observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = 3) -> Tensor:
-    """Return which observations (P, F), 0 or more, are lit: `share` of the pixel's quantile UNSHADED, or more.
+def lit_observations(
+    observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = 3
+) -> Tensor:
+    """Return which observations (P, F), 0 or more, are lit: `share` of the pixel's quantile
+    UNSHADED, or more.
 
-    The `fewest` largest are always lit, because a normal needs three. Those that are not valid (P, F) never are.
+    The `fewest` largest are always lit, because a normal needs three. Those that are not valid (P,
+    F) never are.
     """
     if not len(observations):  # an empty batch has no quantile
         return observations.bool()
@@ -48,13 +53,17 @@ def lit_observations(observations: Tensor, share: float, valid: Tensor | None = 
 RIDGE = 1e-12  # Weight of |b|^2. It matters only if the lights of positive weight are coplanar.
 
 
-def weighted_least_squares(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def weighted_least_squares(
+    observations: Tensor, light_directions: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return b = C L' W I (P, 3), and the xx, yy, zz, xy, xz, yz (6, P) of C = (L' W L + ridge)^-1.
 
-    Observations and weights are (P, F), and light directions (F, 3) or (P, F, 3). All are float64, because weights may
-    differ by many orders of magnitude.
+    Observations and weights are (P, F), and light directions (F, 3) or (P, F, 3). All are float64,
+    because weights may differ by many orders of magnitude.
     """
-    solution, covariance = _solve(observations.T, light_directions, weight.T, direction_products(light_directions))
+    solution, covariance = _solve(
+        observations.T, light_directions, weight.T, direction_products(light_directions)
+    )
     return solution.T, covariance
 
 
@@ -64,12 +73,16 @@ def direction_products(light_directions: Tensor) -> Tensor:
     return torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
 
 
-# In the next three functions, rows are lights and columns pixels: sums over lights, and operations on matrices of
-# 3 x 3, then run along the pixels, three times as fast.
+# In the next three functions, rows are lights and columns pixels: sums over lights, and operations
+# on matrices of 3 x 3, then run along the pixels, three times as fast.
 
 
-def _solve(observed: Tensor, light_directions: Tensor, weight: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
-    """Return b (3, P) and the entries (6, P) of C of weighted_least_squares, from rows (F, P) of lights."""
+def _solve(
+    observed: Tensor, light_directions: Tensor, weight: Tensor, products: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return b (3, P) and the entries (6, P) of C of weighted_least_squares, from rows (F, P) of
+    lights.
+    """
     xx, yy, zz, *mixed = _sum(products, weight).unbind()
     covariance = inverse_3x3((xx + RIDGE, yy + RIDGE, zz + RIDGE, *mixed), RIDGE)
     right_side = _sum(light_directions, weight * observed)
@@ -96,11 +109,15 @@ def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:
 _PRIOR = 1e-4
 
 
-def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return scaled normals b (P, 3) of the robust Lambertian fit: |b| is the albedo, b / |b| the normal.
+def fit_lambertian(
+    observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
+) -> Tensor:
+    """Return scaled normals b (P, 3) of the robust Lambertian fit: |b| is the albedo, b / |b| the
+    normal.
 
-    Each pixel's observations (P, F) are scaled to a largest value of 1. A zero pixel gives b = (0, 0, tiny). The light
-    directions (F, 3) or (P, F, 3) are unit; all observations are valid (P, F) by default.
+    Each pixel's observations (P, F) are scaled to a largest value of 1. A zero pixel gives b = (0,
+    0, tiny). The light directions (F, 3) or (P, F, 3) are unit; all observations are valid (P, F)
+    by default.
     """
     observed = observations.T.contiguous()
     lit = torch.where(observed < SHADOW_SHARE, 1e-3, 1.0).to(observed)
@@ -124,23 +141,26 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """Normals from all lights, and the disagreement between two halves of the lights, whose sign is arbitrary."""
+    """Normals from all lights, and the disagreement between two halves of the lights, whose sign is
+    arbitrary.
+    """
 
     normals: Tensor  # (P, 3), unit, of least squares with all lights
-    # (P, 3), the least-squares solution for the residuals, with the sign flipped in one half, as a share of the albedo.
-    # On a ring of lights, it is half the difference between the normals of the halves
+    # (P, 3), the least-squares solution for the residuals, with the sign flipped in one half, as a
+    # share of the albedo. On a ring of lights, it is half the difference between the normals of the
+    # halves
     change: Tensor
-    # (P, 1), in radians. Its mean square equals the mean square of the normals' random errors, if all observations
-    # have equal noise. Three lights leave no residuals, so they do not show it
+    # (P, 1), in radians. Its mean square equals the mean square of the normals' random errors, if
+    # all observations have equal noise. Three lights leave no residuals, so they do not show it
     noise: Tensor
 
 
 def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
     """Fit all lights, and compare the fits of two halves.
 
-    The observations (P, F) of each pixel are scaled to a largest value of 1, and the light directions (F, 3) or
-    (P, F, 3) are unit, all in float64. The signs (F,) are 1 and -1 for the two halves, the same for all pixels of a
-    capture; see alternating_signs.
+    The observations (P, F) of each pixel are scaled to a largest value of 1, and the light
+    directions (F, 3) or (P, F, 3) are unit, all in float64. The signs (F,) are 1 and -1 for the two
+    halves, the same for all pixels of a capture; see alternating_signs.
     """
     gram = light_directions.mT @ light_directions
     covariance = torch.linalg.inv(gram + RIDGE * torch.eye(3, dtype=gram.dtype, device=gram.device))
@@ -156,11 +176,14 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
 
     shared = light_directions.ndim == 2
     # It is linear, and so one matrix if all pixels have the same lights.
-    found = observations @ compare(torch.eye(len(signs)).to(gram)) if shared else compare(observations)
+    found = (
+        observations @ compare(torch.eye(len(signs)).to(gram)) if shared else compare(observations)
+    )
     scaled, change, difference = torch.split(found, [3, 3, 1], dim=1)
     albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
     normals = scaled / albedo
-    # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest measures noise.
+    # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest
+    # measures noise.
     signs = signs.to(scaled).expand(1 if shared else len(scaled), -1)
     seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
     along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
@@ -170,10 +193,11 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
 
 
 def alternating_signs(light_directions: Tensor) -> Tensor:
-    """Return 1 and -1 in turn (F,) for lights (F, 3) in the order of their azimuths about the middle one.
+    """Return 1 and -1 in turn (F,) for lights (F, 3) in the order of their azimuths about the
+    middle one.
 
-    The light furthest from the middle has 1. So neither the order of the lights nor a rotation of the image changes the
-    halves, unless two lights have the same direction or distance.
+    The light furthest from the middle has 1. So neither the order of the lights nor a rotation of
+    the image changes the halves, unless two lights have the same direction or distance.
     """
     across = light_directions[:, :2] - light_directions[:, :2].mean(dim=0)
     azimuth = torch.atan2(across[:, 1], across[:, 0])
@@ -182,7 +206,8 @@ def alternating_signs(light_directions: Tensor) -> Tensor:
     return 1 - 2 * (place % 2).to(light_directions)
 
 
-# Trimmed LS and IW12 leave out observations below this share of the pixel's quantile UNSHADED, as IW12's authors do.
+# Trimmed LS and IW12 leave out observations below this share of the pixel's quantile UNSHADED, as
+# IW12's authors do.
 FIT_SHADOW_SHARE = 0.1
 
 
@@ -192,22 +217,24 @@ def solve_trimmed(observations: Tensor, light_directions: Tensor) -> Tensor:
     Equal observations are kept or left out together, so the order of the lights does not matter.
     """
     count = observations.shape[1]
-    # A fifth is left out at each end: with ten lights, the two darkest and the two brightest. At least four stay, one
-    # more than a normal and an albedo need.
+    # A fifth is left out at each end: with ten lights, the two darkest and the two brightest. At
+    # least four stay, one more than a normal and an albedo need.
     trimmed = max(0, min(int(0.2 * count), (count - 4) // 2))
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
     middling = (observations >= darkest) & (observations <= brightest)
     weight = lit_observations(observations, FIT_SHADOW_SHARE, middling)
-    scaled_normals, _ = weighted_least_squares(observations, light_directions, weight.to(observations.dtype))
+    scaled_normals, _ = weighted_least_squares(
+        observations, light_directions, weight.to(observations.dtype)
+    )
     return scaled_normals
 
 
 def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     """Return scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
 
-    Iteratively reweighted least squares comes close to the minimum, where three residuals are zero. So the b that
-    makes the three smallest residuals zero is used if it is better.
+    Iteratively reweighted least squares comes close to the minimum, where three residuals are zero.
+    So the b that makes the three smallest residuals zero is used if it is better.
     """
     observed, products = observations.T.contiguous(), direction_products(light_directions)
 
@@ -225,7 +252,8 @@ def solve_l1(observations: Tensor, light_directions: Tensor) -> Tensor:
     return torch.where(residual_there.sum(dim=0) < residual.sum(dim=0), vertex, solution).T
 
 
-# Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at best.
+# Smallest variance of an error, for a largest observation of 1. A camera resolves a thousandth at
+# best.
 SMALLEST_VARIANCE = 1e-6
 
 
@@ -237,19 +265,21 @@ def solve_iw12(
     shadow_share: float = FIT_SHADOW_SHARE,
     iterations: int = 20,
 ) -> Tensor:
-    """Return scaled normals b (P, 3) of I = L b + e with sparse e: each error has its own variance gamma.
+    """Return scaled normals b (P, 3) of I = L b + e with sparse e: each error has its own variance
+    gamma.
 
-    b = (L' W L + sigma^2)^-1 L' W I with W = diag(1 / gamma); gamma_k = e_k^2 + var(e_k), where var(e) is
-    the diagonal of L (L' W L + sigma^2)^-1 L'. Where b explains an observation, its variance shrinks and its weight
-    grows. Shadows and highlights keep a large variance.
+    b = (L' W L + sigma^2)^-1 L' W I with W = diag(1 / gamma); gamma_k = e_k^2 + var(e_k), where
+    var(e) is the diagonal of L (L' W L + sigma^2)^-1 L'. Where b explains an observation, its
+    variance shrinks and its weight grows. Shadows and highlights keep a large variance.
 
-    The constants require a fixed scale: the largest observation of a pixel is 1, so bright and dark pixels are treated
-    alike. Variances start at 1, so the first step is least squares. sigma is 1e-6 (eq. 12), the ridge of
-    weighted_least_squares. Further iterations change the normals of real captures by only some hundredths of a degree
-    on average.
+    The constants require a fixed scale: the largest observation of a pixel is 1, so bright and dark
+    pixels are treated alike. Variances start at 1, so the first step is least squares. sigma is
+    1e-6 (eq. 12), the ridge of weighted_least_squares. Further iterations change the normals of
+    real captures by only some hundredths of a degree on average.
 
-    The observations (P, F), the largest of each pixel 1, and the unit light directions (F, 3) or (P, F, 3) are float64.
-    See lit_observations for `valid` and `shadow_share`; 0 keeps all observations.
+    The observations (P, F), the largest of each pixel 1, and the unit light directions (F, 3) or
+    (P, F, 3) are float64. See lit_observations for `valid` and `shadow_share`; 0 keeps all
+    observations.
     """
     lit = lit_observations(observations, shadow_share, valid).to(observations.dtype).T.contiguous()
     observed, products = observations.T.contiguous(), direction_products(light_directions)

@@ -1,17 +1,19 @@
 """ST14: a bi-polynomial reflectance, fitted to the lowest intensities above the shadows.
 
-B. Shi, P. Tan, Y. Matsushita, K. Ikeuchi, "Bi-polynomial modeling of low-frequency reflectances", TPAMI 2014:
+B. Shi, P. Tan, Y. Matsushita, K. Ikeuchi, "Bi-polynomial modeling of low-frequency reflectances",
+TPAMI 2014:
 
     I_j = rho(n.h_j, l_j.h_j) n.l_j,    rho a polynomial of order 2 in each argument,
 
-with h_j the bisector of light l_j and view v = (0, 0, 1). Highlights affect only the high intensities. The rest of the
-reflectance varies slowly. For a given normal the coefficients are linear, so only the normal is searched (variable
-projection).
+with h_j the bisector of light l_j and view v = (0, 0, 1). Highlights affect only the high
+intensities. The rest of the reflectance varies slowly. For a given normal the coefficients are
+linear, so only the normal is searched (variable projection).
 
-The lowest intensities alone do not determine nine coefficients well. This module therefore differs from the paper in
-two ways. Coefficients are left out if few observations are kept. All but the constant one have a
-Gaussian prior around zero, that is, around Lambert's law. The fit also estimates the noise that the prior is weighed
-against (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
+The lowest intensities alone do not determine nine coefficients well. This module therefore differs
+from the paper in two ways. Coefficients are left out if few observations are kept. All but the
+constant one have a Gaussian prior around zero, that is, around Lambert's law. The fit also
+estimates the noise that the prior is weighed against (D. J. C. MacKay, "Bayesian interpolation",
+Neural Computation 1992), so exact data are fitted exactly.
 """
 
 from __future__ import annotations
@@ -26,17 +28,21 @@ from splinecli.estimate.fits.least_squares import lit_observations, weighted_lea
 
 RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
 
-# Order in which coefficients enter the model. Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come
-# first; within a degree, those with larger a.
+# Order in which coefficients enter the model. Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b.
+# Lower degrees come first; within a degree, those with larger a.
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
 
 
 def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
-    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for dark pixels."""
+    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for
+    dark pixels.
+    """
     lights = light_directions.double()
-    # The normal equations square the condition number, so single precision would not be exact enough.
+    # The normal equations square the condition number, so single precision would not be exact
+    # enough.
     problem = _select(observations.double(), lights)
-    # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse normals.
+    # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse
+    # normals.
     all_alike = torch.ones_like(observations, dtype=torch.float64)
     normals = normalize(weighted_least_squares(observations.double(), lights, all_alike)[0], dim=1)
     # The initial standard deviation, relative to the brightest kept observation
@@ -54,7 +60,9 @@ def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
 
 
 def kept_count(lit: Tensor) -> Tensor:
-    """Return how many of `lit` observations are kept: a quarter (T_low of the paper), at least 8, or all of fewer."""
+    """Return how many of `lit` observations are kept: a quarter (T_low of the paper), at least 8,
+    or all of fewer.
+    """
     return torch.maximum((0.25 * lit).ceil().long(), lit.clamp(max=8))
 
 
@@ -81,7 +89,9 @@ class _Fit(NamedTuple):
     curvature: Tensor  # (P, 2, 2), half the second derivative
 
     def step(self, damping: Tensor) -> Tensor:
-        """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean curvature."""
+        """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean
+        curvature.
+        """
         size = self.curvature.diagonal(dim1=1, dim2=2).mean(dim=1)
         damped = self.curvature + torch.diag_embed((damping * size + 1e-12)[:, None].expand(-1, 2))
         move, _ = torch.linalg.solve_ex(damped, self.gradient)
@@ -90,7 +100,9 @@ class _Fit(NamedTuple):
     def replaced(self, trial: _Fit, better: Tensor) -> _Fit:
         """Return this fit, with the trial's values for the pixels it improves: `better` (P,)."""
         pairs = zip(trial, self, strict=True)
-        return _Fit(*(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs))
+        return _Fit(
+            *(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs)
+        )
 
 
 def _select(observations: Tensor, lights: Tensor) -> _Problem:
@@ -102,7 +114,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
     lit = is_lit.sum(dim=1)
     kept = kept_count(lit)
 
-    # Use as many places as a pixel without shadows needs, so that no pixel depends on the others in its batch.
+    # Use as many places as a pixel without shadows needs, so that no pixel depends on the others in
+    # its batch.
     most = int(kept_count(torch.tensor(count)))
     rank = torch.arange(most, device=lights.device)
     place = (count - lit[:, None] + rank).clamp(max=count - 1)
@@ -125,7 +138,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
         lights=kept_lights * is_kept[..., None],
         bisectors=bisectors,
         light_powers=_powers((kept_lights * bisectors).sum(dim=-1)),
-        # The prior's standard deviation, relative to the brightest kept observation, halves with each degree.
+        # The prior's standard deviation, relative to the brightest kept observation, halves with
+        # each degree.
         precision=torch.where(degree > 0, (0.1 * 0.5 ** (degree - 1)) ** -2, 0),
         ridge=torch.where(left_out, 1e9, 1e-12),
         facing=torch.cat((lights * is_lit[..., None], view.expand(len(observations), 1, 3)), dim=1),
@@ -136,19 +150,22 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     """Fit the coefficients for normals (P, 3) and a variance of the noise (P,)."""
     shading = (problem.lights @ normals[..., None])[..., 0].clamp(min=0)
     powers = _powers((problem.bisectors @ normals[..., None])[..., 0])
-    design = ((shading[..., None] * powers)[..., None] * problem.light_powers[..., None, :]).flatten(-2)
+    design = (
+        (shading[..., None] * powers)[..., None] * problem.light_powers[..., None, :]
+    ).flatten(-2)
     prior = noise[:, None] * problem.precision + problem.ridge
     factor, _ = torch.linalg.cholesky_ex(design.mT @ design + torch.diag_embed(prior))
     coefficients = torch.cholesky_solve(design.mT @ problem.intensities[..., None], factor)
     residual = problem.intensities[..., None] - design @ coefficients
     squares = residual.square().sum(dim=(1, 2))
 
-    # The number of well-determined parameters (MacKay). The two angles of the normal are always included.
+    # The number of well-determined parameters (MacKay). The two angles of the normal are always
+    # included.
     slack = (prior * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2)).sum(dim=1)
     freedom = (problem.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
 
-    # The derivative of the model by the normal, without the part that the coefficients absorb (Kaufman's
-    # approximation).
+    # The derivative of the model by the normal, without the part that the coefficients absorb
+    # (Kaufman's approximation).
     by_power = problem.light_powers @ coefficients.view(-1, 3, 3).mT
     reflectance = (powers * by_power).sum(dim=-1)
     slope = (by_power[..., 1] + 2 * powers[..., 1] * by_power[..., 2]) / -RANGE
@@ -164,7 +181,8 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     away = (-problem.facing @ normals[..., None]).clamp(min=0).sum(dim=(1, 2))
     return _Fit(
         normals=normals,
-        # Normals that face away from the view, or from a light that reaches them, cost 10 a unit of cosine.
+        # Normals that face away from the view, or from a light that reaches them, cost 10 a unit of
+        # cosine.
         cost=squares + (prior * coefficients[..., 0].square()).sum(dim=1) + 10.0 * away,
         noise=squares / freedom.clamp(min=0.5),
         tangents=tangents,

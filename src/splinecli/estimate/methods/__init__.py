@@ -12,26 +12,40 @@ from splinecli.errors import ModelError, check_one_of
 from splinecli.estimate.methods.estimator import Estimator, LeastSquares
 from splinecli.system.machine import Device, Precision
 
-__all__ = ["METHODS", "Estimator", "Method", "MethodOptions", "check_method", "make_estimator", "method_names"]
+__all__ = [
+    "METHODS",
+    "Estimator",
+    "Method",
+    "MethodOptions",
+    "check_method",
+    "make_estimator",
+    "method_names",
+]
 DEFAULT_METHOD = "spline-net"
 
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Settings of a method, None for its default. Each method ignores those that do not apply to it."""
+    """Settings of a method, None for its default. Each method ignores those that do not apply to
+    it.
+    """
 
     weights: str | None = None  # a shipped name or a file
-    rotations: int | None = None  # number of rotations of the lights whose normals a network averages
-    batch_size: int | None = None  # most pixels per batch. A processor computes a batch on each core
+    # number of rotations of the lights whose normals a network averages
+    rotations: int | None = None
+    # most pixels per batch. A processor computes a batch on each core
+    batch_size: int | None = None
     device: Device = "auto"  # where to compute; "auto" is a CUDA GPU if there is one
-    precision: Precision = "auto"  # of a network; "auto" is bfloat16 if the device computes natively in it
+    # of a network; "auto" is bfloat16 if the device computes natively in it
+    precision: Precision = "auto"
 
 
 @dataclass(frozen=True)
 class Method:
     """A row of METHODS."""
 
-    make: Callable[[str, MethodOptions], Estimator]  # from the method's name and its options; does the heavy imports
+    # from the method's name and its options; does the heavy imports
+    make: Callable[[str, MethodOptions], Estimator]
     # principle, source: for the documentation; without a source, the method is splinecli's own
     principle: str
     source: str = "-"
@@ -42,8 +56,8 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
     """Return the estimator of this name.
 
     Methods that run in PyTorch limit its threads to the cores that the process may use; see
-    splinecli.system.machine.use_available_cores. Raises UsageError if the name, the device or a number is not valid,
-    ModelError if the weights cannot be used.
+    splinecli.system.machine.use_available_cores. Raises UsageError if the name, the device or a
+    number is not valid, ModelError if the weights cannot be used.
 
     Examples:
         >>> from splinecli.estimate.methods import make_estimator
@@ -83,7 +97,9 @@ def _network(
     interpolates: bool = True,
     refines: bool = True,
 ) -> Estimator:
-    """Return a network's estimator; one that interpolates has a LI-Net. Raises ModelError for other weights."""
+    """Return a network's estimator; one that interpolates has a LI-Net. Raises ModelError for other
+    weights.
+    """
     from splinecli.estimate.methods.batched import NetworkEstimator
     from splinecli.estimate.networks.weights import resolve_weights
     from splinecli.system.machine import choose_device, choose_precision, use_available_cores
@@ -125,9 +141,12 @@ METHODS: dict[str, Method] = {
     ),
     "ls-trimmed": Method(
         partial(_fit, solve="least_squares:solve_trimmed"),
-        "the same without the darkest and brightest fifth of each pixel's observations and without shadows",
+        "the same without the darkest and brightest fifth of each pixel's observations and without"
+        " shadows",
     ),
-    "l1": Method(partial(_fit, solve="least_squares:solve_l1"), "sum of absolute residuals of I = L b"),
+    "l1": Method(
+        partial(_fit, solve="least_squares:solve_l1"), "sum of absolute residuals of I = L b"
+    ),
     "iw12": Method(
         partial(_fit, solve="least_squares:solve_iw12"),
         "I = L b + e with sparse e, by sparse Bayesian learning",
@@ -140,7 +159,8 @@ METHODS: dict[str, Method] = {
     ),
     "ia14": Method(
         partial(_fit, solve="ia14:solve_ia14", batch_size=1024),
-        "n.l as a monotone Bernstein polynomial of the observation and l.v; one quadratic programme for each pixel",
+        "n.l as a monotone Bernstein polynomial of the observation and l.v; one quadratic"
+        " programme for each pixel",
         "Ikehata and Aizawa, CVPR 2014",
     ),
     "spline-net-pixelwise": Method(

@@ -1,4 +1,6 @@
-"""Estimators in torch, which split the pixels into batches: fits of reflectance models, SPLINE-Net and CNN-PS."""
+"""Estimators in torch, which split the pixels into batches: fits of reflectance models, SPLINE-Net
+and CNN-PS.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +34,19 @@ from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
 Solve = Callable[[Tensor, Tensor], Tensor]
-"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
+"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) ->
+normals (P, 3).
 
-The normals may have any length, 0 for a pixel that has none. All observations are finite, and none is negative."""
+The normals may have any length, 0 for a pixel that has none. All observations are finite, and none
+is negative."""
 
 
 class BatchedEstimator(Estimator):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
-    Each pixel is first divided by its largest observation. Thresholds and priors thus have the same meaning for
-    dark and bright pixels, and the scale of the images does not matter. Raises UsageError for a batch size below 1.
+    Each pixel is first divided by its largest observation. Thresholds and priors thus have the same
+    meaning for dark and bright pixels, and the scale of the images does not matter. Raises
+    UsageError for a batch size below 1.
     """
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
@@ -51,14 +56,21 @@ class BatchedEstimator(Estimator):
         self.fingerprint = f"{name} {self.precision}"
 
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3);
+        see Estimator.
+        """
 
         def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
             batch = batch.clamp(min=0)
             normals = self._solve(batch / map_scale(batch), lights)
-            # The length may be tiny, and normalize would treat such a vector as zero. So divide in two steps.
+            # The length may be tiny, and normalize would treat such a vector as zero. So divide in
+            # two steps.
             largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
             return torch.nn.functional.normalize(normals / largest, dim=1)
 
@@ -87,16 +99,19 @@ def estimate_in_batches(
     columns: int = 3,
     progress: Progress = ignore,
 ) -> NDArray[np.float32]:
-    """Call `solve` on batches of observations, side by side, and return its results (P, columns) as float32.
+    """Call `solve` on batches of observations, side by side, and return its results (P, columns) as
+    float32.
 
-    `solve` returns unit normals in the first three of its columns; zero vectors are replaced by (0, 0, 1), and the
-    other columns are not changed. It gets the observations (P, F) unscaled; the light directions are (F, 3) or (P, F,
-    3). `progress` is called after each batch with the number of its pixels.
+    `solve` returns unit normals in the first three of its columns; zero vectors are replaced by (0,
+    0, 1), and the other columns are not changed. It gets the observations (P, F) unscaled; the
+    light directions are (F, 3) or (P, F, 3). `progress` is called after each batch with the number
+    of its pixels.
     """
     results = np.empty((len(observations), columns), np.float32)
     size = batch_size
     if device == "cpu":
-        # Few pixels make several smaller batches, whatever the number of cores, so that no core waits for another.
+        # Few pixels make several smaller batches, whatever the number of cores, so that no core
+        # waits for another.
         size = min(size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
 
     def solve_batch(start: int) -> int:
@@ -117,30 +132,41 @@ Precision = Literal["float32", "bfloat16"]
 
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 _FEWEST_COVERED = 64  # with fewer fully covered candidates, all are used
-_COVERED = 0.85  # smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
+# smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
+_COVERED = 0.85
 
 
 def context_sample(lighting_at: LightingAt, mask: Bools) -> tuple[Tensor, Tensor]:
-    """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a capture's pixels.
+    """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a
+    capture's pixels.
 
-    The mask (H, W) has one or more true pixels. Outline pixels that the object covers only in part are left out,
-    because they are too dark: on rendered spheres of 40 pixels, they doubled the error of the other pixels. On small
-    objects, the rule also leaves out some steep pixels that are fully covered. It requires a mask that ends at the
-    outline, because it finds the outline in the mask.
+    The mask (H, W) has one or more true pixels. Outline pixels that the object covers only in part
+    are left out, because they are too dark: on rendered spheres of 40 pixels, they doubled the
+    error of the other pixels. On small objects, the rule also leaves out some steep pixels that are
+    fully covered. It requires a mask that ends at the outline, because it finds the outline in the
+    mask.
     """
     n_pixels = int(np.count_nonzero(mask))
     candidates = np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp)
     light = lighting_at(candidates)
-    covered = np.flatnonzero(_is_covered(candidates, light.observations.max(axis=1), mask, lighting_at))
+    covered = np.flatnonzero(
+        _is_covered(candidates, light.observations.max(axis=1), mask, lighting_at)
+    )
     if len(covered) < _FEWEST_COVERED:
         covered = np.arange(len(candidates))
     pixels = covered[sample_of(light.observations[covered])]
-    observations, directions = float_tensors(light.observations[pixels], directions_at(light.directions, pixels))
+    observations, directions = float_tensors(
+        light.observations[pixels], directions_at(light.directions, pixels)
+    )
     return observations, directions
 
 
-def _is_covered(pixels: PixelIndices, brightest: Floats, mask: Bools, lighting_at: LightingAt) -> Bools:
-    """Return which of some pixels (n,), whose largest observations are `brightest`, seem to be fully covered."""
+def _is_covered(
+    pixels: PixelIndices, brightest: Floats, mask: Bools, lighting_at: LightingAt
+) -> Bools:
+    """Return which of some pixels (n,), whose largest observations are `brightest`, seem to be
+    fully covered.
+    """
     from cv2 import erode
 
     covered = np.ones(len(pixels), np.bool_)
@@ -154,29 +180,37 @@ def _is_covered(pixels: PixelIndices, brightest: Floats, mask: Bools, lighting_a
     if not is_inner.any():
         return covered
     numbers = np.cumsum(mask, dtype=np.int32).reshape(mask.shape) - 1
-    known, places = np.unique(numbers[rows[is_inner] - 1, columns[is_inner] - 1], return_inverse=True)
+    known, places = np.unique(
+        numbers[rows[is_inner] - 1, columns[is_inner] - 1], return_inverse=True
+    )
     of_inner = np.zeros(is_inner.shape)
     of_inner[is_inner] = lighting_at(known).observations.max(axis=1)[places]
-    covered[at_outline] = brightest[at_outline] * is_inner.sum(axis=1) >= _COVERED * of_inner.sum(axis=1)
+    covered[at_outline] = brightest[at_outline] * is_inner.sum(axis=1) >= _COVERED * of_inner.sum(
+        axis=1
+    )
     return covered
 
 
 def float_tensors(*arrays: Floats) -> tuple[Tensor, ...]:
-    """Return 32-bit copies or views of arrays, whatever their strides, which tensors accept only when positive."""
+    """Return 32-bit copies or views of arrays, whatever their strides, which tensors accept only
+    when positive.
+    """
     return tuple(torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in arrays)
 
 
 ROTATION_SPAN_DEG = 20.0
-"""Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
+"""Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees
+either way.
+"""
 
 
 class NetworkEstimator(Estimator):
     """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
 
-    `name` is the method's name in the registry, `precision` the number format of the convolutions, and `rotations` the
-    number of averaged estimates, see `rotations_of`. With `refines`, the refinement net, if the weights have one,
-    corrects the map afterwards. Memory grows with the batch size, by about 0.25 MB a pixel. Raises UsageError if
-    rotations or batch_size is below 1.
+    `name` is the method's name in the registry, `precision` the number format of the convolutions,
+    and `rotations` the number of averaged estimates, see `rotations_of`. With `refines`, the
+    refinement net, if the weights have one, corrects the map afterwards. Memory grows with the
+    batch size, by about 0.25 MB a pixel. Raises UsageError if rotations or batch_size is below 1.
     """
 
     def __init__(
@@ -198,20 +232,31 @@ class NetworkEstimator(Estimator):
         self.network = loaded.network.to(device)
         self.has_confidence = self.network.config.error_head
         refine_net = self.network.refine_net
-        self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
+        self.refiner = (
+            NetworkRefiner(refine_net, self.precision)
+            if refines and refine_net is not None
+            else None
+        )
         self.needs_capture = self.refiner is not None or self.network.config.sees_capture
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.network.config.sees_capture:
-            # Older trials used smaller contexts, with all pixels of the outline, and one context for all rotations.
+            # Older trials used smaller contexts, with all pixels of the outline, and one context
+            # for all rotations.
             self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
-            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
+            self.fingerprint += (
+                f", without indirect light, refined in {self.refiner.turns} turns, halved, with"
+                " detail"
+            )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
-        self._contexts: list[CaptureContext | None] = [None] * rotations  # the capture's context in each rotation
+        self._contexts: list[CaptureContext | None] = [
+            None
+        ] * rotations  # the capture's context in each rotation
 
     @torch.no_grad()
     def bind(self, lighting_at: LightingAt, mask: Bools) -> NetworkEstimator:
-        """Return this estimator with the context of one capture, from a sample of its pixels; see Estimator.
+        """Return this estimator with the context of one capture, from a sample of its pixels; see
+        Estimator.
 
         Without it, each call of `estimate` treats its pixels as a capture of their own.
         """
@@ -220,13 +265,22 @@ class NetworkEstimator(Estimator):
         sample, lights = (values.to(self.device) for values in context_sample(lighting_at, mask))
         found = copy.copy(self)
         # One thread, so that the number of threads does not change the rounding.
-        bfloat16 = torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16")
+        bfloat16 = torch.autocast(
+            lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
+        )
         with one_thread_each(), bfloat16:
-            found._contexts = [self.network.encode_context(sample, lights, rotation) for rotation in self._rotations]
+            found._contexts = [
+                self.network.encode_context(sample, lights, rotation)
+                for rotation in self._rotations
+            ]
         return found
 
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 
@@ -252,9 +306,13 @@ class NetworkEstimator(Estimator):
         return results[:, :3], results[:, 3:]
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
-        """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""
+        """Return normals and the distributions of their errors (P, 5). The latter are 0 without an
+        error head.
+        """
         total = batch.new_zeros(len(batch), 5)
-        with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+        with torch.autocast(
+            lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
+        ):
             for rotation, context in zip(self._rotations, self._contexts, strict=True):
                 normals, error = self.network(batch, lights, rotation=rotation, context=context)
                 total[:, :3] += normals
@@ -274,7 +332,9 @@ class NetworkEstimator(Estimator):
         all_observations: Observations,
         all_directions: NDArray[np.float64],
     ) -> ObservationMaps | None:
-        """Return the network's input, LI-Net's output, and the maps of all observations; see Estimator."""
+        """Return the network's input, LI-Net's output, and the maps of all observations; see
+        Estimator.
+        """
         network, config = self.network, self.network.config
         seen, lights, all_seen, all_lights = (
             torch.as_tensor(values, dtype=torch.float32, device=self.device)
@@ -290,11 +350,15 @@ class NetworkEstimator(Estimator):
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
         def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:
-            return np.asarray(values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
+            return np.asarray(
+                values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32
+            )
 
         inside = network.inside.expand_as(dense)
         of_all = known(every.values, every.occupied)
-        return ObservationMaps(known(maps.sparse, maps.occupied), known(dense, inside), of_all, config.grid)
+        return ObservationMaps(
+            known(maps.sparse, maps.occupied), known(dense, inside), of_all, config.grid
+        )
 
     def warn_of_lights(self, n_lights: int) -> list[str]:
         """Return a sentence if the weights were not trained with this number of lights."""
@@ -304,9 +368,10 @@ class NetworkEstimator(Estimator):
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:
     """Return `count` rotations of the lights about the view axis.
 
-    A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles change nothing for
-    a network with a canonical azimuth. It gets small angles across ROTATION_SPAN_DEG, which move the lights over the
-    borders of the cells, and each angle once more with mirrored lights.
+    A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles
+    change nothing for a network with a canonical azimuth. It gets small angles across
+    ROTATION_SPAN_DEG, which move the lights over the borders of the cells, and each angle once more
+    with mirrored lights.
     """
     if not canonical:
         return [Rotation(360.0 * k / count) for k in range(count)]

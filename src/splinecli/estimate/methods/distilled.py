@@ -1,9 +1,11 @@
-"""An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
+"""An estimator made for one capture: a perceptron that learned a network's normals on a sample of
+the pixels.
 
-One capture has one set of lights and a few materials, so most of its pixels are redundant. Under near lamps, the lights
-change smoothly over the image. The network estimates a sample of the pixels, and the perceptron learns from this sample
-and estimates the rest over 100 times as fast. The part that the perceptron does not follow is mostly the network's
-noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network, arXiv 1503.02531).
+One capture has one set of lights and a few materials, so most of its pixels are redundant. Under
+near lamps, the lights change smoothly over the image. The network estimates a sample of the pixels,
+and the perceptron learns from this sample and estimates the rest over 100 times as fast. The part
+that the perceptron does not follow is mostly the network's noise (Hinton, Vinyals and Dean,
+Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
 import itertools
@@ -39,38 +41,50 @@ from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
 CELLS = 256  # number of groups of pixels of like appearance
-EVEN_SHARE = 0.5  # Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups.
+# Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the
+# groups.
+EVEN_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class PixelSample:
     """A sample of pixels, and the appearances that it covers."""
 
-    rows: Tensor  # (N,) distinct numbers of the pixels. The first EVEN_SHARE are an even sample of all pixels
-    centres: Tensor  # (K, C), the features at the centres of the groups, those of fewest pixels first
+    # (N,) distinct numbers of the pixels. The first EVEN_SHARE are an even sample of all pixels
+    rows: Tensor
+    # (K, C), the features at the centres of the groups, those of fewest pixels first
+    centres: Tensor
     n_rare: int  # number of groups of few pixels
-    reach: float  # the largest distance of a pixel, among those that could be drawn, from the nearest centre
+    # the largest distance of a pixel, among those that could be drawn, from the nearest centre
+    reach: float
 
     def unlike(self, features: Tensor) -> Tensor:
-        """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
+        """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than
+        any group reaches.
+        """
         # Twice as fast as torch.cdist.
         products = torch.addmm(self.centres.square().sum(dim=1), features, self.centres.T, alpha=-2)
         squares = features.square().sum(dim=1)
         from_rare, from_others = (
-            (part.amin(dim=1) + squares).clamp(min=0).sqrt() if part.shape[1] else torch.full_like(squares, torch.inf)
+            (part.amin(dim=1) + squares).clamp(min=0).sqrt()
+            if part.shape[1]
+            else torch.full_like(squares, torch.inf)
             for part in (products[:, : self.n_rare], products[:, self.n_rare :])
         )
         # Rounding must not make a pixel of the sample unlike itself.
         return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
 
 
-def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0) -> PixelSample:
+def draw_sample(
+    features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0
+) -> PixelSample:
     """Draw a sample of `size` pixels, or half of all pixels if that is less.
 
-    The pixels are grouped around centres: each further centre is the pixel farthest from all centres so far (Gonzalez,
-    Clustering to minimize the maximum intercluster distance, 1985). Rare appearances thereby get groups of their own.
-    The features (P, C) are of the pixels that may be drawn, and the generator is on the CPU. `rare_share` is the
-    largest share of the pixels in groups that are considered rare.
+    The pixels are grouped around centres: each further centre is the pixel farthest from all
+    centres so far (Gonzalez, Clustering to minimize the maximum intercluster distance, 1985). Rare
+    appearances thereby get groups of their own. The features (P, C) are of the pixels that may be
+    drawn, and the generator is on the CPU. `rare_share` is the largest share of the pixels in
+    groups that are considered rare.
     """
     order = torch.randperm(len(features), generator=generator)
     size = min(size, len(features) // 2)
@@ -87,7 +101,9 @@ def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare
 
 
 def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Return the pixels (K,) at the centres, the group of each pixel (P,), and the largest distance from a centre."""
+    """Return the pixels (K,) at the centres, the group of each pixel (P,), and the largest distance
+    from a centre.
+    """
     centres = [int(((features - features.mean(dim=0)) ** 2).sum(dim=1).argmin())]
     squares = (features * features).sum(dim=1)
     distance = torch.full_like(squares, torch.inf)
@@ -114,16 +130,21 @@ def _rank_in_group(groups: Tensor) -> Tensor:
 BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
-_MOMENTUM, _SQUARES = 0.9, 0.99  # decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
+# decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
+_MOMENTUM, _SQUARES = (
+    0.9,
+    0.99,
+)
 _ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 
 
 class Perceptron(nn.Module):
-    """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
+    """Corrects the least-squares normal of a pixel from its observations, in the capture's order of
+    lights.
 
-    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, if near lamps give each its own. The hidden
-    layers are `width` wide. The generator draws the weights.
+    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, if near lamps give each its
+    own. The hidden layers are `width` wide. The generator draws the weights.
     """
 
     solve: Tensor | None
@@ -134,12 +155,16 @@ class Perceptron(nn.Module):
         super().__init__()
         near = light_directions.ndim == 3
         n_inputs = light_directions.shape[-2] + (6 if near else 3)
-        self.register_buffer("solve", None if near else torch.linalg.pinv(light_directions.double()).T.float())
+        self.register_buffer(
+            "solve", None if near else torch.linalg.pinv(light_directions.double()).T.float()
+        )
         self.register_buffer("mean", torch.zeros(n_inputs))
         self.register_buffer("spread", torch.ones(n_inputs))
         with torch.random.fork_rng(devices=[]):  # the layers draw weights that are replaced below
             sizes = (n_inputs, width, width, width, 5)
-            self.layers = nn.ModuleList(nn.Linear(wide, units) for wide, units in itertools.pairwise(sizes))
+            self.layers = nn.ModuleList(
+                nn.Linear(wide, units) for wide, units in itertools.pairwise(sizes)
+            )
         weights, biases = self._weights_and_biases()
         for weight in weights[:-1]:
             nn.init.kaiming_uniform_(weight, nonlinearity="relu", generator=generator)
@@ -151,18 +176,23 @@ class Perceptron(nn.Module):
         return parameters[::2], parameters[1::2]
 
     def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
-        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3).
+        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F +
+        3).
 
-        The mean direction (P, 3) of lights (P, F, 3) is placed between them, because it encodes the pixel's position.
+        The mean direction (P, 3) of lights (P, F, 3) is placed between them, because it encodes the
+        pixel's position.
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
             return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
         fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
-        return torch.cat((scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1)
+        return torch.cat(
+            (scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1
+        )
 
     def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
-        """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/li_ne_net.py.
+        """Return unit normals (P, 3) and the distributions of their errors (P, 2); see
+        networks/li_ne_net.py.
 
         For the inputs (P, C), see `inputs`. Only the hidden layers compute in bfloat16.
         """
@@ -177,9 +207,10 @@ class Perceptron(nn.Module):
     def gradient(self, inputs: Tensor, normals: Tensor, errors: Tensor) -> list[Tensor]:
         """Return the gradients of the loss, in the order of `parameters`.
 
-        The loss is the mean angle to the normals (P, 3) of pixels with inputs (P, C), and not its square, because the
-        estimator's outliers must not draw the normals of other pixels, and _ERROR_SHARE times the mean square
-        difference from their errors (P, 2). Without autograd, learning takes half of the time.
+        The loss is the mean angle to the normals (P, 3) of pixels with inputs (P, C), and not its
+        square, because the estimator's outliers must not draw the normals of other pixels, and
+        _ERROR_SHARE times the mean square difference from their errors (P, 2). Without autograd,
+        learning takes half of the time.
         """
         (*weights, last), (*biases, offset) = self._weights_and_biases()
         passed = [(inputs - self.mean) / self.spread]
@@ -192,7 +223,9 @@ class Perceptron(nn.Module):
         away = unit - normals
         away /= (away.square().sum(dim=1, keepdim=True) + _ROUNDED**2).sqrt_()
         across = (away - unit * (unit * away).sum(dim=1, keepdim=True)) / length
-        change = torch.cat((across, _ERROR_SHARE * (found[:, 3:] - errors)), dim=1).div_(len(inputs))
+        change = torch.cat((across, _ERROR_SHARE * (found[:, 3:] - errors)), dim=1).div_(
+            len(inputs)
+        )
         gradients: list[Tensor] = []
         for weight, values in zip((last, *reversed(weights)), reversed(passed), strict=True):
             gradients[:0] = change.T @ values, change.sum(dim=0)
@@ -212,30 +245,44 @@ class Perceptron(nn.Module):
         generator: torch.Generator,
         progress: Callable[[], object],
     ) -> None:
-        """Learn the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls `progress` after each step."""
+        """Learn the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls `progress`
+        after each step.
+        """
         parameters = list(self.parameters())
         parameters[-1][3:] = errors.mean(dim=0)
         self.mean.copy_(inputs.mean(dim=0))
         self.spread.copy_(inputs.std(dim=0) + 1e-3)
         values = parameters_to_vector(parameters)
-        vector_to_parameters(values, parameters)  # parts of the vector, which each step changes as a whole
+        # parts of the vector, which each step changes as a whole
+        vector_to_parameters(values, parameters)
         mean, square = torch.zeros_like(values), torch.zeros_like(values)
         order = torch.empty(0, dtype=torch.long)
         for step in range(1, steps + 1):
             if len(order) < BATCH:
                 order = torch.randperm(len(inputs), generator=generator)
             pixels, order = order[:BATCH].to(inputs.device), order[BATCH:]
-            gradient = parameters_to_vector(self.gradient(inputs[pixels], normals[pixels], errors[pixels]))
+            gradient = parameters_to_vector(
+                self.gradient(inputs[pixels], normals[pixels], errors[pixels])
+            )
             mean.lerp_(gradient, 1 - _MOMENTUM)
             square.lerp_(gradient.square_(), 1 - _SQUARES)
-            rate = _LEARNING_RATE * _rate_share(step / steps) * math.sqrt(1 - _SQUARES**step) / (1 - _MOMENTUM**step)
+            rate = (
+                _LEARNING_RATE
+                * _rate_share(step / steps)
+                * math.sqrt(1 - _SQUARES**step)
+                / (1 - _MOMENTUM**step)
+            )
             values.addcdiv_(mean, square.sqrt().add_(1e-8), value=-rate)
             progress()
 
 
 def _rate_share(done: float) -> float:
-    """Return the share of the learning rate after a share of the steps: it rises, and then falls along a cosine."""
-    return min(done / _WARM_UP, 0.5 + 0.5 * math.cos(math.pi * max(0.0, done - _WARM_UP) / (1 - _WARM_UP)))
+    """Return the share of the learning rate after a share of the steps: it rises, and then falls
+    along a cosine.
+    """
+    return min(
+        done / _WARM_UP, 0.5 + 0.5 * math.cos(math.pi * max(0.0, done - _WARM_UP) / (1 - _WARM_UP))
+    )
 
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
@@ -249,19 +296,25 @@ class Distillation:
 
     sample: int  # number of pixels that the network estimated for learning
     held_out: int  # number of these that were not learned. They are an even sample of the capture
-    mean_deg: float  # mean_deg, p95_deg: angles between perceptron and network on the pixels held out
+    # mean_deg, p95_deg: angles between perceptron and network on the pixels held out
+    mean_deg: float
     p95_deg: float
     expected_deg: float  # the mean error that the network expects of itself on them
 
     @property
     def is_good(self) -> bool:
-        """Whether the perceptron follows the network closely enough, compared with the network's own errors."""
-        # On rendered pixels, a larger share increased the error against the truth by 0.3 degrees or more.
+        """Whether the perceptron follows the network closely enough, compared with the network's
+        own errors.
+        """
+        # On rendered pixels, a larger share increased the error against the truth by 0.3 degrees or
+        # more.
         return self.mean_deg <= 0.7 * self.expected_deg
 
 
 class DistilledEstimator(Estimator):
-    """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see distil."""
+    """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see
+    distil.
+    """
 
     has_confidence = True
     needs_capture = True
@@ -269,9 +322,19 @@ class DistilledEstimator(Estimator):
     """The few rare pixels of a tile still fill several batches of the network."""
 
     def __init__(
-        self, teacher: Estimator, perceptron: Perceptron, sample: PixelSample, found: Distillation, size: StudentSize
+        self,
+        teacher: Estimator,
+        perceptron: Perceptron,
+        sample: PixelSample,
+        found: Distillation,
+        size: StudentSize,
     ) -> None:
-        self._teacher, self._perceptron, self._sample, self._size = teacher, perceptron, sample, size
+        self._teacher, self._perceptron, self._sample, self._size = (
+            teacher,
+            perceptron,
+            sample,
+            size,
+        )
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
@@ -280,7 +343,9 @@ class DistilledEstimator(Estimator):
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
     def rebind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
-        """Learn the capture again after its observations changed. Return the network if it cannot be learned."""
+        """Learn the capture again after its observations changed. Return the network if it cannot
+        be learned.
+        """
         teacher = self._teacher.bind(lighting_at, mask)
         try:
             learned = distil(teacher, lighting_at, int(np.count_nonzero(mask)), self._size)
@@ -294,21 +359,33 @@ class DistilledEstimator(Estimator):
         return {
             "sample": found.sample,
             "held_out": found.held_out,
-            "angle_to_network_deg": {"mean": round(found.mean_deg, 4), "p95": round(found.p95_deg, 4)},
+            "angle_to_network_deg": {
+                "mean": round(found.mean_deg, 4),
+                "p95": round(found.p95_deg, 4),
+            },
             "expected_error_deg": round(found.expected_deg, 4),
             "unlike_pixels": self.n_unlike,
         }
 
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see Estimator."""
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see
+        Estimator.
+        """
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
-        unlike = np.empty(len(observations), np.bool_)  # the pixels that are rare, or unlike the sample
+        # the pixels that are rare, or unlike the sample
+        unlike = np.empty(len(observations), np.bool_)
 
         def apply(rows: slice) -> slice:
             own = observations[rows]
-            inputs = _inputs(self._perceptron, own, directions_at(light_directions, rows), self.device)
+            inputs = _inputs(
+                self._perceptron, own, directions_at(light_directions, rows), self.device
+            )
             found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
             normals[rows], errors[rows] = (values.cpu().numpy() for values in found)
             dark = ~(own > 0).any(axis=1)
@@ -338,11 +415,12 @@ def distil(
     seed: int = 0,
     progress: Progress = ignore,
 ) -> DistilledEstimator:
-    """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of the pixels.
+    """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of
+    the pixels.
 
-    The result is the same for the same seed. The teacher has confidence, and is bound to the capture; see
-    Estimator.bind. `progress` is called with numbers of pixels; in all, twice the pixels of the sample. Raises
-    UsageError if too few pixels are lit for a sample of FEWEST_PIXELS.
+    The result is the same for the same seed. The teacher has confidence, and is bound to the
+    capture; see Estimator.bind. `progress` is called with numbers of pixels; in all, twice the
+    pixels of the sample. Raises UsageError if too few pixels are lit for a sample of FEWEST_PIXELS.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     light = lighting_at(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
@@ -355,13 +433,19 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False):  # its tensors could not be changed in place outside of it
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through the network.
+        # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through
+        # the network.
         rare_share = min(0.005, size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         pixels = sample.rows.numpy()
-        taught = teacher.estimate_with_error(candidates[pixels], directions_at(directions, pixels), progress=progress)
+        taught = teacher.estimate_with_error(
+            candidates[pixels], directions_at(directions, pixels), progress=progress
+        )
         inputs = inputs[sample.rows.to(inputs.device)]
-        normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
+        normals, errors = (
+            torch.as_tensor(np.asarray(values, np.float32), device=inputs.device)
+            for values in taught
+        )
         held = round(len(inputs) / 8)  # the first pixels are an even sample of all
         share = len(inputs) / size.steps
         done = 0.0
@@ -379,7 +463,9 @@ def distil(
         learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
     mean_deg, p95_deg = float(angles.mean()), float(np.quantile(angles, 0.95))
-    found = Distillation(len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean()))
+    found = Distillation(
+        len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean())
+    )
     return DistilledEstimator(teacher, perceptron, sample, found, size)
 
 

@@ -1,7 +1,8 @@
-"""The interface that every method of photometric stereo implements, and least squares; imported without PyTorch.
+"""The interface that every method of photometric stereo implements, and least squares; imported
+without PyTorch.
 
-LS: Lambertian least squares. R. J. Woodham, "Photometric method for determining surface orientation from multiple
-images", 1980.
+LS: Lambertian least squares. R. J. Woodham, "Photometric method for determining surface orientation
+from multiple images", 1980.
 """
 
 from __future__ import annotations
@@ -43,33 +44,39 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
-    return StudentSize(usual, max(500, usual // 12), 96), StudentSize(larger, max(500, larger // 12), 192)
+    return StudentSize(usual, max(500, usual // 12), 96), StudentSize(
+        larger, max(500, larger // 12), 192
+    )
 
 
 Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
 
-# (F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to the
-# camera.
+# (F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x
+# right, y up, z to the camera.
 Directions = NDArray[np.floating]
 
 
 def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) -> Directions:
-    """Return the light directions of some pixels: those that all pixels share, or the pixels' own."""
+    """Return the light directions of some pixels: those that all pixels share,
+    or the pixels' own.
+    """
     return light_directions if light_directions.ndim == 2 else light_directions[pixels]
 
 
-TILE_PIXELS = 16_384  # pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+# pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+TILE_PIXELS = 16_384
 
 
 class Estimator:
-    """A method that estimates the normals of pixels from their observations, and all hooks that a method may have.
+    """A method that estimates the normals of pixels from their observations, and all hooks that a
+    method may have.
 
     A method without a hook inherits the one that does nothing.
 
-    name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it has none.
-    device, precision: where and in which number format it computes; the report states both.
-    fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
-    has_confidence: whether it also estimates its own accuracy.
+    name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it
+    has none. device, precision: where and in which number format it computes; the report states
+    both. fingerprint: name, weights and settings as one string. Equal fingerprints give equal
+    normals, apart from rounding. has_confidence: whether it also estimates its own accuracy.
     needs_capture: whether its estimate of a pixel depends on the other pixels and the mask.
     tile_pixels: the number of pixels that it gets at once.
     refiner: corrects the map of normals, using the neighbourhood of each pixel; or None.
@@ -86,30 +93,41 @@ class Estimator:
     refiner: NetworkRefiner | None = None
 
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> NDArray[np.floating]:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
-        A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations are (P, F), the light
-        directions (F, 3) or (P, F, 3). `progress` is called after each batch with the number of its pixels. A method
-        without confidence overrides this, all others estimate_with_error.
+        A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations
+        are (P, F), the light directions (F, 3) or (P, F, 3). `progress` is called after each batch
+        with the number of its pixels. A method without confidence overrides this, all others
+        estimate_with_error.
         """
         return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     def estimate_with_error(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
         """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
-        The latter are None without confidence. networks/li_ne_net.py describes the two numbers. A pixel that is dark
-        under every light gets UNKNOWN_ERROR.
+        The latter are None without confidence. networks/li_ne_net.py describes the two numbers. A
+        pixel that is dark under every light gets UNKNOWN_ERROR.
         """
         return self.estimate(observations, light_directions, progress=progress), None
 
     def bind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
-        """Return the estimator for one capture, possibly with an encoded sample of its pixels as context.
+        """Return the estimator for one capture, possibly with an encoded sample of its pixels as
+        context.
 
-        `lighting_at` gives the observations and the light directions of some of the pixels of the mask (H, W).
+        `lighting_at` gives the observations and the light directions of some of the pixels of the
+        mask (H, W).
         """
         return self
 
@@ -126,7 +144,8 @@ class Estimator:
     ) -> ObservationMaps | None:
         """Return the observation maps of some pixels, or None for a method without them.
 
-        The observations (P, F) and (P, F') are of the same pixels, under directions (F, 3) and (F', 3).
+        The observations (P, F) and (P, F') are of the same pixels, under directions (F, 3) and (F',
+        3).
         """
         return None
 
@@ -136,7 +155,9 @@ class Estimator:
 
 
 class ObservationMaps(NamedTuple):
-    """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation; NaN in empty cells."""
+    """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation;
+    NaN in empty cells.
+    """
 
     sparse: NDArray[np.float32]  # the input of the network
     dense: NDArray[np.float32]  # the output of LI-Net
@@ -150,26 +171,38 @@ UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))  # of an unknown normal, who
 
 
 def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions (P, 2)."""
+    """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions
+    (P, 2).
+    """
     import torch
 
     from splinecli.estimate.networks.li_ne_net import probability_within
 
-    return np.asarray(probability_within(torch.from_numpy(errors), CONFIDENT_DEG).numpy(), np.float32)
+    return np.asarray(
+        probability_within(torch.from_numpy(errors), CONFIDENT_DEG).numpy(), np.float32
+    )
 
 
 TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is dark under every light
 
 
 class LeastSquares(Estimator):
-    """Minimise |I - L b| over all observations, including shadows; n = b / |b|. In float64 on the CPU."""
+    """Minimise |I - L b| over all observations, including shadows; n = b / |b|. In float64 on the
+    CPU.
+    """
 
     name = fingerprint = "ls"
 
     def estimate(
-        self, observations: Observations, light_directions: Directions, *, progress: Progress = ignore
+        self,
+        observations: Observations,
+        light_directions: Directions,
+        *,
+        progress: Progress = ignore,
     ) -> NDArray[np.float64]:
-        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3);
+        see Estimator.
+        """
         values = observations.astype(np.float64)
         if light_directions.ndim == 2:
             scaled = values @ np.linalg.pinv(light_directions).T

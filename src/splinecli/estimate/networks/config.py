@@ -1,4 +1,6 @@
-"""Network configurations: everything that rebuilds a network, and the fits that it may start from."""
+"""Network configurations: everything that rebuilds a network,
+and the fits that it may start from.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +23,29 @@ HEAD_WIDTH = 16  # channels of an attention head of the set branch
 
 
 STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "ls": lambda observed, lights, valid: weighted_least_squares(observed, lights, valid.to(observed.dtype))[0],
+    "ls": lambda observed, lights, valid: weighted_least_squares(
+        observed, lights, valid.to(observed.dtype)
+    )[0],
     "iw12": solve_iw12,
     "iw12-all": partial(solve_iw12, shadow_share=0),
     "ia14": solve_ia14,
 }
-"""Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better on metals."""
+"""Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better
+on metals.
+"""
 
 
 @torch.no_grad()
 def fit_normals(
-    names: Sequence[str], observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
+    names: Sequence[str],
+    observations: Tensor,
+    light_directions: Tensor,
+    valid: Tensor | None = None,
 ) -> Tensor:
     """Return unit normals (P, K, 3) of K fits among STARTING_FITS, zero where a fit has none.
 
-    The observations (P, F) have a largest value of 1 in each pixel. The light directions are unit, (F, 3) or (P, F, 3).
-    `valid` is (P, F) bool, all by default.
+    The observations (P, F) have a largest value of 1 in each pixel. The light directions are unit,
+    (F, 3) or (P, F, 3). `valid` is (P, F) bool, all by default.
     """
     if not names:
         return observations.new_zeros(len(observations), 0, 3)
@@ -58,28 +67,36 @@ class NetworkConfig:
 
     # "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
     size: Literal["paper", "compact"] = "compact"
-    map_size: Annotated[int, Meta(ge=8, le=128, multiple_of=4)] = MAP_SIZE  # cells along a side of the observation map
+    # cells along a side of the observation map
+    map_size: Annotated[int, Meta(ge=8, le=128, multiple_of=4)] = MAP_SIZE
     width: Annotated[int, Meta(ge=2, le=4096)] = 64  # channels of the compact size
     # li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size
     li_blocks: Depth = 2
     ne_blocks: Depth = 3
-    head_width: Annotated[int, Meta(ge=1, le=4096)] = 256  # hidden features of NE-Net's head in the compact size
-    grid: Grid = "even"  # how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
-    # the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact size
-    # only.
+    # hidden features of NE-Net's head in the compact size
+    head_width: Annotated[int, Meta(ge=1, le=4096)] = 256
+    # how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
+    grid: Grid = "even"
+    # the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian
+    # fit. Compact size only.
     fits: tuple[str, ...] = ()
     # whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
     interpolates: bool = True
     error_head: bool = False  # whether NE-Net also estimates its own error. Compact size only.
-    refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
+    # whether a refinement net corrects the map of normals afterwards. Needs an error head.
+    refines: bool = False
     refines_twice: bool = False  # whether a second refinement net follows the first
-    set_width: Annotated[int, Meta(ge=0, le=4096)] = 0  # channels of the set branch, 0 for none. Compact size only.
+    # channels of the set branch, 0 for none. Compact size only.
+    set_width: Annotated[int, Meta(ge=0, le=4096)] = 0
     set_layers: Depth = 3  # attention layers of the set branch
-    sees_capture: bool = False  # whether a sample of the capture is an input of each pixel. Needs a set branch.
+    # whether a sample of the capture is an input of each pixel. Needs a set branch.
+    sees_capture: bool = False
 
     @property
     def is_canonical(self) -> bool:
-        """Whether the lights of each pixel are turned until its robust Lambertian normal has azimuth zero."""
+        """Whether the lights of each pixel are turned until its robust Lambertian normal has
+        azimuth zero.
+        """
         return self.size == "compact"
 
     def to_dict(self) -> dict[str, Any]:
@@ -88,11 +105,16 @@ class NetworkConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or value."""
+        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or
+        value.
+        """
         config = cls(**settings(cls, values, "network setting", ModelError))
         for fit in config.fits:
             if fit not in STARTING_FITS:
-                raise ModelError(f"network setting 'fits' has {fit!r}; expected a list of {', '.join(STARTING_FITS)}")
+                raise ModelError(
+                    f"network setting 'fits' has {fit!r}; expected a list of"
+                    f" {', '.join(STARTING_FITS)}"
+                )
         for name in ("fits", "error_head", "set_width"):
             if getattr(config, name) and config.size != "compact":
                 raise ModelError(f"network setting {name!r} needs the size 'compact'")
@@ -103,7 +125,12 @@ class NetworkConfig:
         if config.sees_capture and not config.set_width:
             raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
         if config.set_width % HEAD_WIDTH:
-            raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
+            raise ModelError(
+                f"network setting 'set_width' is {config.set_width}; expected a multiple of"
+                f" {HEAD_WIDTH}"
+            )
         if config.grid != "even" and config.size != "paper":
-            raise ModelError(f"network setting 'grid' is {config.grid!r}; it needs the size 'paper'")
+            raise ModelError(
+                f"network setting 'grid' is {config.grid!r}; it needs the size 'paper'"
+            )
         return config

@@ -13,7 +13,9 @@ Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
 
 
 def zeroed(layer: Layer) -> Layer:
-    """Set the weights and offsets of a layer to zero and return it, so that its correction is zero at first."""
+    """Set the weights and offsets of a layer to zero and return it, so that its correction is zero
+    at first.
+    """
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer
@@ -48,13 +50,19 @@ def _in_both_directions(transform: tuple[tuple[float, ...], ...]) -> Tensor:
     return torch.kron(matrix, matrix)
 
 
-# The transforms F(4, 3) of values, weights and products (Lavin and Gray, Fast algorithms for convolutional neural
-# networks, CVPR 2016, equation 13). The first and the last of six values are padding: their columns are left out.
+# The transforms F(4, 3) of values, weights and products (Lavin and Gray, Fast algorithms for
+# convolutional neural networks, CVPR 2016, equation 13). The first and the last of six values are
+# padding: their columns are left out.
 _OF_VALUES = _in_both_directions(
     ((0, -5, 0, 1), (-4, -4, 1, 1), (4, -4, -1, 1), (-2, -1, 2, 1), (2, -1, -2, 1), (4, 0, -5, 0))
 )
-_OF_WEIGHTS = _in_both_directions(((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24))) / 24**2
-_OF_PRODUCTS = _in_both_directions(((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1)))
+_OF_WEIGHTS = (
+    _in_both_directions(((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24)))
+    / 24**2
+)
+_OF_PRODUCTS = _in_both_directions(
+    ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
+)
 
 
 def winograd_weights(weight: Tensor) -> Tensor:
@@ -63,9 +71,11 @@ def winograd_weights(weight: Tensor) -> Tensor:
 
 
 def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor:
-    """Convolve maps (16, P, C) of SIDE x SIDE positions with `winograd_weights`, padded with zeros: (16, P, D).
+    """Convolve maps (16, P, C) of SIDE x SIDE positions with `winograd_weights`, padded with zeros:
+    (16, P, D).
 
-    It takes 36 products for the 144 of a convolution, and each transform is one product of matrices.
+    It takes 36 products for the 144 of a convolution, and each transform is one product of
+    matrices.
     """
     _, n_maps, width = x.shape
     values = (_OF_VALUES @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
@@ -76,7 +86,9 @@ def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor
 
 
 def is_float32(values: Tensor) -> bool:
-    """Return whether the layers compute in float32 on the CPU: autocast is off, and so are the values."""
+    """Return whether the layers compute in float32 on the CPU: autocast is off, and so are the
+    values.
+    """
     autocast = torch.is_autocast_enabled(values.device.type)
     return values.device.type == "cpu" and values.dtype == torch.float32 and not autocast
 
@@ -84,8 +96,9 @@ def is_float32(values: Tensor) -> bool:
 class MapEncoder(nn.Module):
     """Encodes maps (P, C, w, w) as features (P, width, w / 4, w / 4).
 
-    Each patch of 4 x 4 cells becomes one position, which is fast on a CPU. Each position gets a learned embedding,
-    because cells are light directions, so unlike a photograph, a map is not translation invariant.
+    Each patch of 4 x 4 cells becomes one position, which is fast on a CPU. Each position gets a
+    learned embedding, because cells are light directions, so unlike a photograph, a map is not
+    translation invariant.
     """
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
@@ -98,12 +111,16 @@ class MapEncoder(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         if maps.shape[-1] == SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
             return self._few_products(maps)
-        patches = nn.functional.pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
+        patches = nn.functional.pixel_unshuffle(maps, PATCH).contiguous(
+            memory_format=torch.channels_last
+        )
         features: Tensor = self.blocks(self.patches(patches) + self.position)
         return features
 
     def _few_products(self, maps: Tensor) -> Tensor:
-        """Return the same features of maps of SIDE x SIDE patches by Winograd's algorithm, in half of the time."""
+        """Return the same features of maps of SIDE x SIDE patches by Winograd's algorithm, in half
+        of the time.
+        """
         convolutions = [layer for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
         layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
@@ -112,8 +129,13 @@ class MapEncoder(nn.Module):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
             split = maps[start : start + _AT_ONCE].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
             patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
-            x = nn.functional.linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
-            for first, second in zip(layers[::2], layers[1::2], strict=True):  # of each residual block
+            x = (
+                nn.functional.linear(patches, self.patches.weight.flatten(1), self.patches.bias)
+                + position
+            )
+            for first, second in zip(
+                layers[::2], layers[1::2], strict=True
+            ):  # of each residual block
                 x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
             found[start : start + _AT_ONCE] = x.transpose(0, 1)
         return found.transpose(1, 2).view(-1, self.position.shape[1], SIDE, SIDE)
@@ -123,28 +145,39 @@ HIDDEN = 64
 
 
 class ErrorHead(nn.Module):
-    """Estimates a log-logistic distribution of the error (P, 2) from NE-Net's hidden features and its normals.
+    """Estimates a log-logistic distribution of the error (P, 2) from NE-Net's hidden features and
+    its normals.
 
-    The first number is the logarithm of the median error in radians, with _MORE_DEG added. The second is the logarithm
-    of the distribution's shape: a larger shape means a narrower distribution. The other layers are fixed while the
-    head is trained, so it does not change the normals.
+    The first number is the logarithm of the median error in radians, with _MORE_DEG added. The
+    second is the logarithm of the distribution's shape: a larger shape means a narrower
+    distribution. The other layers are fixed while the head is trained, so it does not change the
+    normals.
     """
 
     def __init__(self, features: int, normals: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(features + 3 * normals, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 2))
+        self.layers = nn.Sequential(
+            nn.Linear(features + 3 * normals, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 2)
+        )
 
     def forward(self, features: Tensor, normals: Tensor) -> Tensor:
-        """Estimate from features (P, C) and normals (P, K, 3): the fitted normals, and the estimate before scaling."""
-        error: Tensor = self.layers(torch.cat((features, normals.flatten(1).to(features.dtype)), dim=1))
+        """Estimate from features (P, C) and normals (P, K, 3): the fitted normals, and the estimate
+        before scaling.
+        """
+        error: Tensor = self.layers(
+            torch.cat((features, normals.flatten(1).to(features.dtype)), dim=1)
+        )
         return error.float()
 
 
-_MORE_DEG = 0.1  # Added to all errors. Otherwise the logarithm would emphasise differences between tiny errors.
+# Added to all errors. Otherwise the logarithm would emphasise differences between tiny errors.
+_MORE_DEG = 0.1
 
 
 def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
-    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under distributions (P, 2)."""
+    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under
+    distributions (P, 2).
+    """
     median, shape = error.unbind(-1)
     z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
     return z + 2 * nn.functional.softplus(-z) - shape
@@ -167,11 +200,13 @@ _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES
 
 
 class CaptureHead(nn.Module):
-    """Adjusts log-logistic distributions of errors (P, 2), whose two numbers are described in ErrorHead.
+    """Adjusts log-logistic distributions of errors (P, 2), whose two numbers are described in
+    ErrorHead.
 
-    Wrong lights and values add an error of their own, whatever error the network predicts. The new median is therefore
-    the scaled old one, plus one predicted from the features, plus a share of the rotation due to gamma-encoded values.
-    The head is small on purpose: it was trained on only hundreds of captures.
+    Wrong lights and values add an error of their own, whatever error the network predicts. The new
+    median is therefore the scaled old one, plus one predicted from the features, plus a share of
+    the rotation due to gamma-encoded values. The head is small on purpose: it was trained on only
+    hundreds of captures.
     """
 
     mean: Tensor
@@ -189,30 +224,38 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            self.linear.bias[1] = -3.5  # initial value of the logarithm of the median error in radians
+            self.linear.bias[
+                1
+            ] = -3.5  # initial value of the logarithm of the median error in radians
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
-        """Return the adjusted distributions (P, 2) of the errors (P, 2), from features of the pixels (P, 2).
+        """Return the adjusted distributions (P, 2) of the errors (P, 2), from features of the
+        pixels (P, 2).
 
-        The features of the capture (20,) or (P, 20) are in the order of CaptureFeatures. NaN means unknown.
+        The features of the capture (20,) or (P, 20) are in the order of CaptureFeatures. NaN means
+        unknown.
         """
         inputs = torch.cat((errors, pixels, capture.expand(len(errors), -1)), dim=1)
         inputs = ((inputs - self.mean) / self.spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
         found = self.linear(inputs) + self.last(self.hidden(inputs).tanh())
         median = torch.logaddexp(errors[:, 0] + found[:, 0], found[:, 1])
-        # Gamma-encoded values rotate the normals by about this angle, however good the fit is otherwise.
-        bent = capture[..., 11] + math.log(math.pi / 180) + self.bend  # 11 is the index of CaptureFeatures.bend_turn
+        # Gamma-encoded values rotate the normals by about this angle, however good the fit is
+        # otherwise.
+        # 11 is the index of CaptureFeatures.bend_turn
+        bent = capture[..., 11] + math.log(math.pi / 180) + self.bend
         median = torch.logaddexp(median, bent.expand(len(errors)))
         return torch.stack((median, errors[:, 1] + found[:, 2]), dim=1)
 
 
 class PaperLINet(nn.Module):
-    """The authors' LI-Net (Zheng et al., ICCV 2019): (P, 1, w, w) to the same shape, in 0..1; 8.40 M parameters.
+    """The authors' LI-Net (Zheng et al., ICCV 2019): (P, 1, w, w) to the same shape, in 0..1; 8.40
+    M parameters.
 
-    Its layers are a 7x7 conv to 64 channels, two 4x4 convs of stride 2 to 128 and 256, six residual blocks, two
-    transposed convs back, a 7x7 conv and a sigmoid. No conv has a bias. An instance norm with a scale and an offset per
-    channel follows every conv but the last. It normalises by the statistics of each map, even after training: the
-    authors track running statistics but never use them.
+    Its layers are a 7x7 conv to 64 channels, two 4x4 convs of stride 2 to 128 and 256, six residual
+    blocks, two transposed convs back, a 7x7 conv and a sigmoid. No conv has a bias. An instance
+    norm with a scale and an offset per channel follows every conv but the last. It normalises by
+    the statistics of each map, even after training: the authors track running statistics but never
+    use them.
     """
 
     def __init__(self) -> None:
@@ -252,7 +295,9 @@ class _PaperResidualBlock(nn.Module):
 
 
 class CompactLINet(nn.Module):
-    """An encoder-decoder on 4 x 4 patches, from (P, 4, w, w) to a correction (P, 1, w, w) that is zero at first."""
+    """An encoder-decoder on 4 x 4 patches, from (P, 4, w, w) to a correction (P, 1, w, w) that is
+    zero at first.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -267,12 +312,13 @@ DROPOUT = 0.2  # share of the channels dropped in training at the paper size
 
 
 class PaperNENet(nn.Module):
-    """The authors' CNN-PS (Ikehata, ECCV 2018) on two maps: (P, channels, w, w) to (P, 3), not of unit length.
+    """The authors' CNN-PS (Ikehata, ECCV 2018) on two maps: (P, channels, w, w) to (P, 3), not of
+    unit length.
 
-    It has 2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128 layer. As in the
-    authors' code, no ReLU comes before the last 1x1 conv or between the two linear layers, and the pooling
-    windows overlap: 4 x 4 at a stride of 2. Dropout removes whole channels, in training only. The authors leave it
-    enabled at test time, which adds noise to their normals.
+    It has 2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128
+    layer. As in the authors' code, no ReLU comes before the last 1x1 conv or between the two linear
+    layers, and the pooling windows overlap: 4 x 4 at a stride of 2. Dropout removes whole channels,
+    in training only. The authors leave it enabled at test time, which adds noise to their normals.
     """
 
     def __init__(self, channels: int, map_size: int) -> None:
@@ -296,7 +342,9 @@ class PaperNENet(nn.Module):
 
 
 class _DenseBlock(nn.Module):
-    """Two 3x3 convs of 16 channels, each concatenated to its input: (P, C, ...) to (P, C + 32, ...)."""
+    """Two 3x3 convs of 16 channels, each concatenated to its input: (P, C, ...) to (P, C + 32,
+    ...).
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -311,11 +359,13 @@ class _DenseBlock(nn.Module):
 
 
 class CompactNENet(nn.Module):
-    """Maps (P, 4 or 5, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
+    """Maps (P, 4 or 5, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit
+    length.
 
-    The result is a weighted sum of the starting normals plus a correction. Initially the first normal has weight
-    1, and all else is zero. With K = 0 this weight is fixed. Features (P, set_width) from the set branch are added to
-    the hidden layer. The second result is the output of the error head (P, 2), None without one.
+    The result is a weighted sum of the starting normals plus a correction. Initially the first
+    normal has weight 1, and all else is zero. With K = 0 this weight is fixed. Features (P,
+    set_width) from the set branch are added to the hidden layer. The second result is the output of
+    the error head (P, 2), None without one.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -335,7 +385,9 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.zero_()[0] = 1
-        self.join = nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
+        self.join = (
+            nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
+        )
         self.error_head = ErrorHead(head_width, fits + 2) if config.error_head else None
 
     def forward(
@@ -357,4 +409,6 @@ class CompactNENet(nn.Module):
         out: Tensor = start + self.out(hidden)
         if self.error_head is None:
             return out, None
-        return out, self.error_head(hidden, torch.cat((normals, out[:, None].to(normals.dtype)), dim=1))
+        return out, self.error_head(
+            hidden, torch.cat((normals, out[:, None].to(normals.dtype)), dim=1)
+        )

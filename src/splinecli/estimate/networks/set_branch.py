@@ -1,9 +1,10 @@
-"""The set branch: attention over the raw observations of a pixel and over the other pixels of its capture.
-
-Ten observations are consistent with many pairs of a normal and a reflectance. An object has few materials, and pixels
-with other normals sample the same reflectance at other angles. Universal photometric stereo (Ikehata, CVPR 2022 and
-2023) demonstrates the benefit of communication between pixels. Here each pixel attends to the tokens of a sample of its
+"""The set branch: attention over the raw observations of a pixel and over the other pixels of its
 capture.
+
+Ten observations are consistent with many pairs of a normal and a reflectance. An object has few
+materials, and pixels with other normals sample the same reflectance at other angles. Universal
+photometric stereo (Ikehata, CVPR 2022 and 2023) demonstrates the benefit of communication between
+pixels. Here each pixel attends to the tokens of a sample of its capture.
 """
 
 from typing import NamedTuple
@@ -37,7 +38,9 @@ class CaptureContext(NamedTuple):
 
 
 class PixelTokens(NamedTuple):
-    """The tokens of P pixels, and the numbers that they are relative to; see SplineNet.encode_pixels."""
+    """The tokens of P pixels, and the numbers that they are relative to; see
+    SplineNet.encode_pixels.
+    """
 
     tokens: Tensor  # (P, width)
     normal_z: Tensor  # (P, 1), of the fitted normals
@@ -46,7 +49,8 @@ class PixelTokens(NamedTuple):
 
 
 def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in (P, F).
+    """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in
+    (P, F).
 
     These are at most SAMPLE lit pixels, evenly spaced. If no pixel is lit, the first one is used.
     """
@@ -55,7 +59,8 @@ def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
-    """Return the logarithm (P, 1) of the largest observation of each pixel (P, 1) over its capture's brightness (G,).
+    """Return the logarithm (P, 1) of the largest observation of each pixel (P, 1) over its
+    capture's brightness (G,).
 
     Pixel p belongs to capture p % G.
     """
@@ -64,7 +69,8 @@ def brightness_level(largest: Tensor, brightness: Tensor) -> Tensor:
 
 
 class ContextLayer(nn.Module):
-    """Adds information from the tokens of a capture to the tokens of its pixels, by attention and as a mean.
+    """Adds information from the tokens of a capture to the tokens of its pixels, by attention and
+    as a mean.
 
     Initially, it adds nothing.
     """
@@ -75,23 +81,40 @@ class ContextLayer(nn.Module):
         self.query_norm, self.key_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.queries = nn.Linear(width, width)
         self.keys_values = nn.Linear(width, 2 * width)
-        self.pooled = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
-        self.join = nn.Sequential(nn.Linear(3 * width, 2 * width), nn.GELU(), zeroed(nn.Linear(2 * width, width)))
+        self.pooled = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
+        self.join = nn.Sequential(
+            nn.Linear(3 * width, 2 * width), nn.GELU(), zeroed(nn.Linear(2 * width, width))
+        )
 
-    def forward(self, tokens: Tensor, level: Tensor, captures: int, known: Summary | None) -> tuple[Tensor, Summary]:
+    def forward(
+        self, tokens: Tensor, level: Tensor, captures: int, known: Summary | None
+    ) -> tuple[Tensor, Summary]:
         """Return the updated tokens (P, width), and the summary of their captures.
 
-        For the level (P, 1), see brightness_level. Pixel p belongs to capture p % `captures`. `known` is the summary of
-        one capture; None uses the pixels themselves as the samples of their captures.
+        For the level (P, 1), see brightness_level. Pixel p belongs to capture p % `captures`.
+        `known` is the summary of one capture; None uses the pixels themselves as the samples of
+        their captures.
         """
-        embedded = self.embed(torch.cat((tokens, level), dim=1)).view(-1, captures, tokens.shape[1]).transpose(0, 1)
+        embedded = (
+            self.embed(torch.cat((tokens, level), dim=1))
+            .view(-1, captures, tokens.shape[1])
+            .transpose(0, 1)
+        )
         summary = self._summarise(embedded) if known is None else known
         queries = self.query_norm(embedded)
         with torch.autocast(tokens.device.type, enabled=False):
             # Use float32, as in the set branch.
-            parts = _split(self.queries(queries.to(self.queries.weight.dtype))), summary.keys, summary.values
+            parts = (
+                _split(self.queries(queries.to(self.queries.weight.dtype))),
+                summary.keys,
+                summary.values,
+            )
             found = nn.functional.scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
-        seen = torch.cat((queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2)
+        seen = torch.cat(
+            (queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2
+        )
         return tokens + self.join(seen).transpose(0, 1).reshape(tokens.shape), summary
 
     def _summarise(self, embedded: Tensor) -> Summary:
@@ -111,20 +134,25 @@ _PRIOR = 1e-4  # keeps the weighted least squares solvable if fewer than three l
 class SetBranch(nn.Module):
     """A transformer over the F observations of each pixel.
 
-    It has one token for each observation and one for the pixel. The token of an observation is computed from
-    its light direction, its value, the residual of the Lambertian fit, and the cosines between the starting normals and
-    its light and half vector. The tokens yield a weight and a corrected value for each observation, and weighted least
-    squares gives a normal. Initially the weights are equal and the values are not corrected.
+    It has one token for each observation and one for the pixel. The token of an observation is
+    computed from its light direction, its value, the residual of the Lambertian fit, and the
+    cosines between the starting normals and its light and half vector. The tokens yield a weight
+    and a corrected value for each observation, and weighted least squares gives a normal. Initially
+    the weights are equal and the values are not corrected.
 
     With capture context, the pixel's token attends to the tokens of other pixels after each layer.
     """
 
-    def __init__(self, width: int, layers: int, normals: int, *, sees_capture: bool = False) -> None:
+    def __init__(
+        self, width: int, layers: int, normals: int, *, sees_capture: bool = False
+    ) -> None:
         super().__init__()
         self.observation = nn.Linear(6 + 2 * normals, width)
         self.pixel = nn.Linear(3 * normals + 1, width)
         self.layers = nn.ModuleList(_AttentionLayer(width) for _ in range(layers))
-        self.contexts = nn.ModuleList(ContextLayer(width) for _ in range(layers)) if sees_capture else None
+        self.contexts = (
+            nn.ModuleList(ContextLayer(width) for _ in range(layers)) if sees_capture else None
+        )
         self.norm = nn.LayerNorm(width)
         self.weigh = zeroed(nn.Linear(width, 2))
 
@@ -140,12 +168,14 @@ class SetBranch(nn.Module):
         captures: int = 1,
         context: CaptureContext | None = None,
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
-        """Return the pixels' tokens (P, width), the unit normals (P, 3) of least squares, and the captures' context.
+        """Return the pixels' tokens (P, width), the unit normals (P, 3) of least squares, and the
+        captures' context.
 
-        The observed values and residuals (P, F) of each pixel are divided by its largest observation, `scale` (P, 1).
-        The lights (P, F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals
-        (P, K, 3) are unit or zero. Pixel p belongs to capture p % `captures`. Without a context, the pixels of each
-        capture attend to each other.
+        The observed values and residuals (P, F) of each pixel are divided by its largest
+        observation, `scale` (P, 1). The lights (P, F, 3) are unit, in the pixels' frames, `valid`
+        (P, F) is None for all, and the starting normals (P, K, 3) are unit or zero. Pixel p belongs
+        to capture p % `captures`. Without a context, the pixels of each capture attend to each
+        other.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + 1e-3).log()  # the offset keeps the logarithm finite
@@ -159,7 +189,11 @@ class SetBranch(nn.Module):
         if valid is not None:
             mask = torch.cat((valid.new_ones(len(valid), 1), valid), dim=1)[:, None, None]
         if self.contexts is not None:
-            brightness = scale.view(-1, captures).median(dim=0).values if context is None else context.brightness
+            brightness = (
+                scale.view(-1, captures).median(dim=0).values
+                if context is None
+                else context.brightness
+            )
             level = brightness_level(scale, brightness)
         found: list[Summary] = []
         for number, layer in enumerate(self.layers):
@@ -171,7 +205,9 @@ class SetBranch(nn.Module):
                 found.append(summary)
         tokens = self.norm(tokens)
         with torch.autocast(observed.device.type, enabled=False):
-            log_weight, correction = self.weigh(tokens[:, 1:].to(self.weigh.weight.dtype)).unbind(-1)
+            log_weight, correction = self.weigh(tokens[:, 1:].to(self.weigh.weight.dtype)).unbind(
+                -1
+            )
             weight = log_weight.clamp(-10, 10).exp()
             weight = weight if valid is None else weight * valid
             fitted = _weighted_normals(observed + correction, lights, weight)
@@ -179,7 +215,9 @@ class SetBranch(nn.Module):
 
 
 class _AttentionLayer(nn.Module):
-    """Attention and a perceptron on tokens (P, T, width). Each is preceded by a layer norm and added to its input."""
+    """Attention and a perceptron on tokens (P, T, width). Each is preceded by a layer norm and
+    added to its input.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -187,17 +225,24 @@ class _AttentionLayer(nn.Module):
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.queries_keys_values = nn.Linear(width, 3 * width)
         self.attended = nn.Linear(width, width)
-        self.perceptron = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.perceptron = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
 
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         pixels, count, width = tokens.shape
-        split = self.queries_keys_values(self.norm1(tokens)).view(pixels, count, 3, self.heads, HEAD_WIDTH)
+        split = self.queries_keys_values(self.norm1(tokens)).view(
+            pixels, count, 3, self.heads, HEAD_WIDTH
+        )
         queries, keys, values = split.permute(2, 0, 3, 1, 4)
         if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
-            # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its gradient up to six times.
+            # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its gradient up
+            # to six times.
             queries, keys, values = queries.float(), keys.float(), values.float()
         with torch.autocast(tokens.device.type, enabled=False):
-            attended = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+            attended = nn.functional.scaled_dot_product_attention(
+                queries, keys, values, attn_mask=mask
+            )
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out

@@ -1,8 +1,9 @@
-"""SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to normals.
+"""SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to
+normals.
 
-The differences of the compact size are described in docs/method.md. Its dense map has the scale of the sparse map, the
-largest observation. Values above 1 are clipped, so that a highlight under another light does not change the scale of
-all other values.
+The differences of the compact size are described in docs/method.md. Its dense map has the scale of
+the sparse map, the largest observation. Values above 1 are clipped, so that a highlight under
+another light does not change the scale of all other values.
 """
 
 import math
@@ -16,14 +17,21 @@ from splinecli.estimate.networks.config import NetworkConfig, fit_normals
 from splinecli.estimate.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet, PaperNENet
 from splinecli.estimate.networks.refine_net import RefineNet
 from splinecli.estimate.networks.set_branch import CaptureContext, PixelTokens, SetBranch
-from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
+from splinecli.maths.observation_map import (
+    cell_directions,
+    map_scale,
+    rotate_about_view_axis,
+    sparse_map,
+    unit_disc,
+)
 
 
 class Rotation(NamedTuple):
     """A rotation of the lights about the view axis, and a reflection."""
 
     turn_deg: float | Tensor = 0.0  # angle in degrees, a number or (P,)
-    # whether y is flipped after the rotation. An isotropic pixel looks the same if its lights are mirrored, too.
+    # whether y is flipped after the rotation. An isotropic pixel looks the same if its lights are
+    # mirrored, too.
     mirror: bool = False
 
 
@@ -31,9 +39,12 @@ NO_ROTATION = Rotation()
 
 
 class PixelMaps(NamedTuple):
-    """Observation maps of P pixels with the associated fits and lights, in each pixel's own frame."""
+    """Observation maps of P pixels with the associated fits and lights,
+    in each pixel's own frame.
+    """
 
-    # sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation
+    # sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an
+    # observation
     sparse: Tensor
     occupied: Tensor
     residual: Tensor
@@ -53,14 +64,18 @@ class PixelMaps(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Unit normals (P, 3), and the distributions of their errors (P, 2), None without an error head."""
+    """Unit normals (P, 3), and the distributions of their errors (P, 2), None without an error
+    head.
+    """
 
     normals: Tensor
     error: Tensor | None
 
 
 class SplineNet(nn.Module):
-    """LI-Net, NE-Net and all steps from raw observations to normals; the refinement nets then run on the normal map."""
+    """LI-Net, NE-Net and all steps from raw observations to normals; the refinement nets then run
+    on the normal map.
+    """
 
     cells: Tensor
     inside: Tensor
@@ -79,7 +94,9 @@ class SplineNet(nn.Module):
         self.set_branch: SetBranch | None = None
         if config.set_width:
             fits = 1 + len(config.fits)
-            self.set_branch = SetBranch(config.set_width, config.set_layers, fits, sees_capture=config.sees_capture)
+            self.set_branch = SetBranch(
+                config.set_width, config.set_layers, fits, sees_capture=config.sees_capture
+            )
         self.refine_net: RefineNet | None = None
         if config.refines:
             self.refine_net = RefineNet(twice=config.refines_twice)
@@ -95,10 +112,11 @@ class SplineNet(nn.Module):
         valid: Tensor | None = None,
         rotation: Rotation = NO_ROTATION,
     ) -> PixelMaps:
-        """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
+        """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the
+        pixels' frames.
 
-        Observations that are not valid (P, F) are ignored. The given rotation is applied after the rotation to the
-        canonical azimuth.
+        Observations that are not valid (P, F) are ignored. The given rotation is applied after the
+        rotation to the canonical azimuth.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale
@@ -107,12 +125,17 @@ class SplineNet(nn.Module):
         else:
             scaled_normals = observed.new_tensor((0.0, 0.0, 1.0)).expand(len(observed), 3)
         x, y, z = scaled_normals.unbind(-1)
-        # Move a fit that points away from the camera to the rim, which has the closest visible normal.
+        # Move a fit that points away from the camera to the rim, which has the closest visible
+        # normal.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
-        angle = torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
+        angle = (
+            torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
+        )
         cosine, sine = angle.cos(), angle.sin()
-        lights = rotate_about_view_axis(light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None])
+        lights = rotate_about_view_axis(
+            light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
+        )
         scaled_normals = rotate_about_view_axis(torch.stack((x, y, z), dim=-1), cosine, sine)
         fitted = fit_normals(self.config.fits, observed, light_directions, valid)
         fitted = rotate_about_view_axis(fitted, cosine[:, None], sine[:, None])
@@ -144,23 +167,33 @@ class SplineNet(nn.Module):
         )
 
     def interpolate(self, maps: PixelMaps) -> Tensor | None:
-        """Return the dense maps of LI-Net (P, 1, w, w), zero outside the unit disc; None without a LI-Net."""
+        """Return the dense maps of LI-Net (P, 1, w, w), zero outside the unit disc; None without a
+        LI-Net.
+        """
         if self.li_net is None:
             return None
         if self.config.size == "paper":
             dense: Tensor = self.li_net(maps.sparse)
         else:
-            inputs = torch.cat((maps.sparse, maps.occupied, maps.residual, maps.lambertian_map), dim=1)
+            inputs = torch.cat(
+                (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map), dim=1
+            )
             dense = maps.lambertian_map + self.li_net(inputs)
         return dense * self.inside
 
     def estimate(
-        self, maps: PixelMaps, dense: Tensor | None, *, captures: int = 1, context: CaptureContext | None = None
+        self,
+        maps: PixelMaps,
+        dense: Tensor | None,
+        *,
+        captures: int = 1,
+        context: CaptureContext | None = None,
     ) -> Estimate:
         """Return the normals of NE-Net in the pixels' frames, and their errors.
 
-        Pixel p belongs to capture p % `captures`. The context comes from `encode_context`; without one, the pixels of
-        each capture attend to each other, if the network has layers for capture context.
+        Pixel p belongs to capture p % `captures`. The context comes from `encode_context`; without
+        one, the pixels of each capture attend to each other, if the network has layers for capture
+        context.
         """
         interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
@@ -171,7 +204,9 @@ class SplineNet(nn.Module):
             if self.set_branch is not None:
                 features, fitted, _ = self._read_set(maps, normals, captures, context)
                 normals = torch.cat((normals, fitted[:, None]), dim=1)
-            raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals, features)
+            raw, error = self.ne_net(
+                torch.cat((*channels, *interpolated), dim=1), normals, features
+            )
         return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
 
     def forward(
@@ -184,12 +219,13 @@ class SplineNet(nn.Module):
     ) -> Estimate:
         """Return normals in the capture's frame, and their errors.
 
-        The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
-        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context comes from `encode_context`;
-        without one, all pixels attend to each other, if the network has layers for capture context. See build_maps for
-        the other arguments.
+        The observations (P, F) are linear, divided by the light intensities, of any scale. The
+        light directions are unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. The context
+        comes from `encode_context`; without one, all pixels attend to each other, if the network
+        has layers for capture context. See build_maps for the other arguments.
         """
-        # Only the convolutions may run in bfloat16: the fits and the geometry of the maps need full precision.
+        # Only the convolutions may run in bfloat16: the fits and the geometry of the maps need full
+        # precision.
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
         normals, error = self.estimate(maps, self.interpolate(maps), context=context)
@@ -198,10 +234,11 @@ class SplineNet(nn.Module):
     def encode_context(
         self, observations: Tensor, light_directions: Tensor, rotation: Rotation = NO_ROTATION
     ) -> CaptureContext | None:
-        """Return the context of a capture from a sample of its pixels; None if the network does not use context.
+        """Return the context of a capture from a sample of its pixels; None if the network does not
+        use context.
 
-        The observations (P, F), the light directions and the rotation are as in `forward`. About SAMPLE pixels are
-        enough.
+        The observations (P, F), the light directions and the rotation are as in `forward`. About
+        SAMPLE pixels are enough.
         """
         if self.set_branch is None or not self.config.sees_capture:
             return None
@@ -224,7 +261,11 @@ class SplineNet(nn.Module):
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
         tokens, fitted, found = self._read_set(maps, _starting_normals(maps), captures, context)
-        count = torch.full_like(maps.scale, observations.shape[1]) if valid is None else valid.sum(1, keepdim=True)
+        count = (
+            torch.full_like(maps.scale, observations.shape[1])
+            if valid is None
+            else valid.sum(1, keepdim=True)
+        )
         return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count.to(maps.scale)), found
 
     def _read_set(

@@ -1,4 +1,6 @@
-"""The weight files of the networks that estimate normals: the shipped ones, and those that `train` writes."""
+"""The weight files of the networks that estimate normals: the shipped ones, and those that `train`
+writes.
+"""
 
 import json
 import os
@@ -44,14 +46,20 @@ def save_weights(network: SplineNet, path: Path) -> None:
 
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
-    """Load the network in a weight file, named `name` or after the file without its suffix. Raises ModelError."""
+    """Load the network in a weight file, named `name` or after the file without its suffix. Raises
+    ModelError.
+    """
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
     tensors, metadata = read_tensors(path, FORMAT, hint)
     config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
-    with torch.device("meta"):  # allocates no memory, because the configuration may request any size
-        load_strictly(SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path)
+    with torch.device(
+        "meta"
+    ):  # allocates no memory, because the configuration may request any size
+        load_strictly(
+            SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path
+        )
     network = SplineNet(config)
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():
@@ -69,16 +77,19 @@ def shipped_names() -> list[str]:
 def manifest() -> dict[str, dict[str, Any]]:
     """Return the entries of assets/weights.json, which describe the shipped weights, by name.
 
-    Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training. Some
-    have `capture_head`, the `file` and `sha256` of the head that adjusts the confidence using the whole capture, and
-    `material_net`, those of the net that predicts materials from the tokens of their set branch.
+    Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most
+    lights in training. Some have `capture_head`, the `file` and `sha256` of the head that adjusts
+    the confidence using the whole capture, and `material_net`, those of the net that predicts
+    materials from the tokens of their set branch.
     """
     entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
 
 
 def untrained_warning(sha256: str, n_lights: int) -> list[str]:
-    """Return a warning if these are shipped weights that were not trained with this number of lights."""
+    """Return a warning if these are shipped weights that were not trained with this number of
+    lights.
+    """
     for name, entry in manifest().items():
         fewest, most = entry["lights"]
         if entry["sha256"] == sha256 and not fewest <= n_lights <= most:
@@ -95,7 +106,10 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         # os.path is false for names that are too long for a file, where Path raises.
         if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
-            raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
+            raise ModelError(
+                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors"
+                " file"
+            )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:
         check_shipped(path, entry["sha256"], name_or_file)
@@ -103,7 +117,9 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
 
 
 def capture_head(sha256: str) -> CaptureHead | None:
-    """Load the capture head for weights with this checksum, or None if they have none. Raises ModelError."""
+    """Load the capture head for weights with this checksum, or None if they have none. Raises
+    ModelError.
+    """
     for entry in manifest().values():
         if entry["sha256"] == sha256 and "capture_head" in entry:
             return load_shipped(CaptureHead(), entry["capture_head"], HEAD_FORMAT)

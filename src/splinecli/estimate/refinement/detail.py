@@ -1,8 +1,8 @@
 """Detail that the refinement net smooths away although it is real.
 
-The net relies on the errors that SPLINE-Net predicts. Many of these are the same everywhere, for example those from
-wrong light intensities, and contain no information about detail. Real detail agrees between two halves of the lights;
-noise does not.
+The net relies on the errors that SPLINE-Net predicts. Many of these are the same everywhere, for
+example those from wrong light intensities, and contain no information about detail. Real detail
+agrees between two halves of the lights; noise does not.
 
 A capture at half the resolution, and its results at the full one.
 """
@@ -25,33 +25,45 @@ from splinecli.maths.normals import unit
 from splinecli.system.machine import side_by_side
 
 Floats = NDArray[np.float32]
-_DARK = 1e-6  # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
+# weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
+_DARK = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class HalfCapture:
-    """A capture of half the size: each pixel is the mean of the masked ones in a block of 2 x 2 of another capture."""
+    """A capture of half the size: each pixel is the mean of the masked ones in a block of 2 x 2 of
+    another capture.
+    """
 
     mask: NDArray[np.bool_]  # (H / 2, W / 2), with Q true pixels
     observations: Floats  # (Q, F)
     normals: Floats  # (Q, 3), unit, in the capture's frame
     errors: Floats  # (Q, 2)
-    members: PixelIndices  # (Q,), the row in the other capture of one pixel of each block, whose lights hold for it
+    # (Q,), the row in the other capture of one pixel of each block, whose lights hold for it
+    members: PixelIndices
     whole: LightingAt  # gives the light of the other capture's pixels
 
     @classmethod
     def of(
-        cls, mask: NDArray[np.bool_], lighting_at: LightingAt, normals: Floats, errors: Floats, reference: float
+        cls,
+        mask: NDArray[np.bool_],
+        lighting_at: LightingAt,
+        normals: Floats,
+        errors: Floats,
+        reference: float,
     ) -> HalfCapture:
-        """Return half of a capture with a mask (H, W), both even, of P true pixels, and the brightness `reference`.
+        """Return half of a capture with a mask (H, W), both even, of P true pixels, and the
+        brightness `reference`.
 
-        `lighting_at` gives the observations and light directions of some pixels. The normals (P, 3) and errors (P, 2)
-        are in the capture's frame.
+        `lighting_at` gives the observations and light directions of some pixels. The normals (P, 3)
+        and errors (P, 2) are in the capture's frame.
         """
         half = _over_blocks(np.logical_or, mask)
         rows_above, done_above = pixels_before(mask), pixels_before(half)
         n_half, n_lights = int(done_above[-1]), lighting_at(np.arange(1)).observations.shape[1]
-        values, of_normals, of_errors = (np.empty((n_half, columns), np.float32) for columns in (n_lights, 3, 2))
+        values, of_normals, of_errors = (
+            np.empty((n_half, columns), np.float32) for columns in (n_lights, 3, 2)
+        )
         small = cls(half, values, of_normals, of_errors, np.empty(n_half, np.int32), lighting_at)
         step = max(1, LIT_AT_ONCE // (2 * mask.shape[1]))  # rows of blocks
 
@@ -68,7 +80,10 @@ class HalfCapture:
             weights = np.maximum(largest, np.float32(_DARK * reference))
             found = np.hstack((normals[rows], errors[rows])) * weights
             sent = np.hstack((observations * equal, equal, found, weights))
-            maps, numbers = np.zeros((*seen.shape, sent.shape[1]), np.float32), np.zeros(seen.shape, np.int32)
+            maps, numbers = (
+                np.zeros((*seen.shape, sent.shape[1]), np.float32),
+                np.zeros(seen.shape, np.int32),
+            )
             maps[seen], numbers[seen] = sent, rows
             sums = _over_blocks(np.add, maps)[kept]
             done = slice(done_above[first], done_above[last])
@@ -86,25 +101,33 @@ class HalfCapture:
         return replace(self.whole(self.members[rows]), observations=self.observations[rows])
 
     def enlarged(self, box: Box) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return normals (3, h, w), not of unit length, and errors (2, h, w) in a box of the other capture's map.
+        """Return normals (3, h, w), not of unit length, and errors (2, h, w) in a box of the other
+        capture's map.
 
-        They are interpolated bilinearly between pixels of the mask. The box is between even rows and columns.
+        They are interpolated bilinearly between pixels of the mask. The box is between even rows
+        and columns.
         """
         rows, columns = (slice(max(0, side.start // 2 - 1), side.stop // 2 + 1) for side in box)
         mask = self.mask[rows]
-        numbers = mask.cumsum(dtype=np.int32).reshape(mask.shape) + (np.count_nonzero(self.mask[: rows.start]) - 1)
+        numbers = mask.cumsum(dtype=np.int32).reshape(mask.shape) + (
+            np.count_nonzero(self.mask[: rows.start]) - 1
+        )
         mask, numbers = mask[:, columns], numbers[:, columns]
         values = np.zeros((*mask.shape, 5), np.float32)
         some = numbers[mask]
         values[mask] = np.hstack((self.normals[some], self.errors[some]))
         maps = enlarge(torch.from_numpy(values).permute(2, 0, 1), torch.from_numpy(mask))
         top, left = box[0].start - 2 * rows.start, box[1].start - 2 * columns.start
-        maps = maps[:, top : top + box[0].stop - box[0].start, left : left + box[1].stop - box[1].start]
+        maps = maps[
+            :, top : top + box[0].stop - box[0].start, left : left + box[1].stop - box[1].start
+        ]
         return maps[:3], maps[3:]
 
 
 def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return maps (C, h, w) at twice the resolution, interpolated bilinearly between the pixels of a mask (h, w)."""
+    """Return maps (C, h, w) at twice the resolution, interpolated bilinearly between the pixels of
+    a mask (h, w).
+    """
     weights = mask.to(maps)[None]
     weighed = torch.cat((maps * weights, weights))[None]
     found = torch.nn.functional.interpolate(weighed, scale_factor=2, mode="bilinear")[0]
@@ -112,7 +135,9 @@ def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 
 def _over_blocks(function: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
-    """Return a function of the four values (H, W, ...) in each block of 2 x 2, (H / 2, W / 2, ...)."""
+    """Return a function of the four values (H, W, ...) in each block of 2 x 2, (H / 2, W / 2,
+    ...).
+    """
     rows = function(values[::2], values[1::2])
     return np.asarray(function(rows[:, ::2], rows[:, 1::2]))
 
@@ -124,45 +149,62 @@ FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show 
 _TINY = 1e-12
 
 
-def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, mask: Tensor) -> Tensor:
+def restore_detail(
+    refined: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, mask: Tensor
+) -> Tensor:
     """Add detail to refined normals that the refinement net removed although it is real.
 
-    The detail comes from SPLINE-Net's normals. It is considered real where the additional detail of least squares is
-    clearly larger than its noise, and to the extent that both agree. Images that are shifted towards their lights, by
-    half a pixel for example, have the same effect as detail.
+    The detail comes from SPLINE-Net's normals. It is considered real where the additional detail of
+    least squares is clearly larger than its noise, and to the extent that both agree. Images that
+    are shifted towards their lights, by half a pixel for example, have the same effect as detail.
 
-    All normals (3, H, W) are unit. The least squares had at least FEWEST_LIGHTS lights, and the noise (1, H, W) is
-    theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0, and the other maps are zero outside,
-    as is the result. Black pixels stay as they are.
+    All normals (3, H, W) are unit. The least squares had at least FEWEST_LIGHTS lights, and the
+    noise (1, H, W) is theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0,
+    and the other maps are zero outside, as is the result. Black pixels stay as they are.
     """
     mask = mask * least_squares.any(dim=0)  # black pixels carry no information
-    removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
-    alike = _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
+    removed, missing, noise = (
+        _detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise)
+    )
+    alike = (
+        _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
+    )
     return unit_maps(refined + _real_share(missing, noise) * alike * removed)
 
 
 def restore_octave(
-    enlarged: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, largest: Tensor, mask: Tensor
+    enlarged: Tensor,
+    estimated: Tensor,
+    least_squares: Tensor,
+    noise: Tensor,
+    largest: Tensor,
+    mask: Tensor,
 ) -> Tensor:
-    """Add detail to normals from half the resolution, taken from SPLINE-Net's normals where it is real.
+    """Add detail to normals from half the resolution, taken from SPLINE-Net's normals where it is
+    real.
 
-    Detail is the part of the normals that is lost when they are halved, as by HalfCapture, and enlarged again (Burt and
-    Adelson, The Laplacian pyramid as a compact image code, 1983). It is considered real where the detail of least
-    squares is clearly larger than its noise. Bright pixels get more weight than dark ones, by their largest observation
-    (1, H, W).
+    Detail is the part of the normals that is lost when they are halved, as by HalfCapture, and
+    enlarged again (Burt and Adelson, The Laplacian pyramid as a compact image code, 1983). It is
+    considered real where the detail of least squares is clearly larger than its noise. Bright
+    pixels get more weight than dark ones, by their largest observation (1, H, W).
 
-    The enlarged normals (3, H, W) are unit, as is the result, which is zero outside the mask. See restore_detail for
-    the other arguments. The maps begin at even rows and columns.
+    The enlarged normals (3, H, W) are unit, as is the result, which is zero outside the mask. See
+    restore_detail for the other arguments. The maps begin at even rows and columns.
     """
     mask = mask * least_squares.any(dim=0)
     largest = largest * mask
-    detail, missing = ((maps - unit_maps(_without_octave(maps, largest))) * mask for maps in (estimated, least_squares))
+    detail, missing = (
+        (maps - unit_maps(_without_octave(maps, largest))) * mask
+        for maps in (estimated, least_squares)
+    )
     noise = (noise - _without_octave(noise, largest)) * mask
     return unit_maps(enlarged + _real_share(missing * largest, noise * largest) * detail)
 
 
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:
-    """Return the share (H, W) of missing detail (3, H, W) to restore, given the noise (1, H, W) in it."""
+    """Return the share (H, W) of missing detail (3, H, W) to restore, given the noise (1, H, W) in
+    it.
+    """
     real = 1 - _energy(noise, noise) / _energy(missing, missing)
     # Nothing is restored below 0.7, and everything above 0.9.
     return ((real - 0.7) / (0.9 - 0.7)).clamp(0, 1)

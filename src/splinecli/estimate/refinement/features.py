@@ -1,4 +1,6 @@
-"""Inputs of the refinement net for each pixel: its estimated normal and error, and how its observations fit them."""
+"""Inputs of the refinement net for each pixel: its estimated normal and error, and how its
+observations fit them.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,20 @@ def refine_features(
     reference: float,
     signs: Tensor,
 ) -> Tensor:
-    """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to 1.
+    """Return the features (P, CHANNELS) of pixels in the order of FEATURE_WIDTHS, each about -1 to
+    1.
 
-    The observations (P, F) are linear, divided by the light intensities. The light directions (F, 3) or (P, F, 3) and
-    the normals (P, 3) are unit. See networks/li_ne_net.py for the error (P, 2), `brightness` for the reference, and
-    alternating_signs of fits/least_squares.py for the signs (F,), the halves of the capture's lights.
+    The observations (P, F) are linear, divided by the light intensities. The light directions (F,
+    3) or (P, F, 3) and the normals (P, 3) are unit. See networks/li_ne_net.py for the error (P, 2),
+    `brightness` for the reference, and alternating_signs of fits/least_squares.py for the signs
+    (F,), the halves of the capture's lights.
     """
     scale = map_scale(observations)
     observed = observations / scale
     count = observed.shape[1]
-    robust = torch.nn.functional.normalize(least_squares.fit_lambertian(observed, light_directions), dim=-1)
+    robust = torch.nn.functional.normalize(
+        least_squares.fit_lambertian(observed, light_directions), dim=-1
+    )
     plain, change, noise = two_halves(observed, light_directions, signs)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.
@@ -67,18 +73,24 @@ def refine_features(
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
-    """Return compare_halves in double precision, from observations (P, F) with a largest value of 1."""
+    """Return compare_halves in double precision, from observations (P, F) with a largest value of
+    1.
+    """
     found = least_squares.compare_halves(observed.double(), light_directions.double(), signs)
     return TwoHalves(*(values.to(observed) for values in found))
 
 
 def brightness(observations: Tensor) -> float:
-    """Return the brightness of a capture: the median over its pixels (P, F) of the largest observation."""
+    """Return the brightness of a capture: the median over its pixels (P, F) of the largest
+    observation.
+    """
     return max(float(observations.amax(dim=1).median()), 1e-12)
 
 
 class Turn(NamedTuple):
-    """A mirror image (x is flipped) if `mirror`, then `quarters` counterclockwise rotations by 90 degrees."""
+    """A mirror image (x is flipped) if `mirror`, then `quarters` counterclockwise rotations by 90
+    degrees.
+    """
 
     quarters: int
     mirror: bool = False
@@ -95,9 +107,14 @@ def turn_features(features: Tensor, turn: Turn) -> Tensor:
 
 
 def turn_maps(
-    maps: Tensor, turn: Turn, vectors: Sequence[tuple[int, int]] = (), tensors: Sequence[tuple[int, int, int]] = ()
+    maps: Tensor,
+    turn: Turn,
+    vectors: Sequence[tuple[int, int]] = (),
+    tensors: Sequence[tuple[int, int, int]] = (),
 ) -> Tensor:
-    """Rotate maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
+    """Rotate maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy
+    of tensors.
+    """
     if turn.mirror:
         maps = maps.flip(-1)
         for odd in (*(x for x, _ in vectors), *(xy for _, _, xy in tensors)):

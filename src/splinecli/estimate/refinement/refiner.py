@@ -1,8 +1,9 @@
 """The refinement nets on a whole capture: in tiles, and on large captures at a lower resolution.
 
-The nets were trained on objects of a hundred to three hundred pixels a side. On larger maps, their receptive field
-covers less of the object, and their results are worse. So a large capture is halved until it has about the size of
-the training objects, and then enlarged octave by octave, with the detail that is real; see detail.py.
+The nets were trained on objects of a hundred to three hundred pixels a side. On larger maps, their
+receptive field covers less of the object, and their results are worse. So a large capture is halved
+until it has about the size of the training objects, and then enlarged octave by octave, with the
+detail that is real; see detail.py.
 """
 
 from __future__ import annotations
@@ -16,8 +17,20 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.estimate.fits.least_squares import alternating_signs
-from splinecli.estimate.networks.refine_net import CHANNELS, COARSEST, Part, RefineNet, channels, unit_maps
-from splinecli.estimate.refinement.detail import FEWEST_LIGHTS, HalfCapture, restore_detail, restore_octave
+from splinecli.estimate.networks.refine_net import (
+    CHANNELS,
+    COARSEST,
+    Part,
+    RefineNet,
+    channels,
+    unit_maps,
+)
+from splinecli.estimate.refinement.detail import (
+    FEWEST_LIGHTS,
+    HalfCapture,
+    restore_detail,
+    restore_octave,
+)
 from splinecli.estimate.refinement.detail import REACH as DETAIL_REACH
 from splinecli.estimate.refinement.features import (
     Turn,
@@ -27,18 +40,24 @@ from splinecli.estimate.refinement.features import (
     turn_maps,
     two_halves,
 )
-from splinecli.estimate.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
+from splinecli.estimate.refinement.tiles import (
+    Band,
+    Tile,
+    around_object,
+    rows_of_tiles,
+    turned_part,
+)
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
 from splinecli.maths.observation_map import map_scale
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress, ignore
 
-# Pixels around a tile that the nets use as context, a multiple of COARSEST. Two nets reach further (RefineNet's
-# `reach`), but context beyond the margin changes no normal by more than 0.01 degrees. A margin of 64, which is enough
-# for one net, leaves visible seams with two.
+# Pixels around a tile that the nets use as context, a multiple of COARSEST. Two nets reach further
+# (RefineNet's `reach`), but context beyond the margin changes no normal by more than 0.01 degrees.
+# A margin of 64, which is enough for one net, leaves visible seams with two.
 MARGIN = 112
-# Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin. Larger tiles take
-# less time, because their margins are smaller in total, but more memory.
+# Side of the part of the map that is refined at once, a multiple of COARSEST, without its margin.
+# Larger tiles take less time, because their margins are smaller in total, but more memory.
 TILE = 512
 
 MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at full resolution
@@ -64,12 +83,14 @@ class _Capture:
 
 @dataclass(eq=False)
 class NetworkRefiner:
-    """Corrects a capture's normals, and the distributions of their errors, using the neighbourhood of each pixel.
+    """Corrects a capture's normals, and the distributions of their errors, using the neighbourhood
+    of each pixel.
 
-    The network is one refinement net or two, on their device, and `precision` the number format of the convolutions.
-    The results of `turns` quarter turns of the map are averaged; adding mirror images does not help. With a margin of
-    the net's `reach`, tiles change nothing. Captures of fewer than FEWEST_LIGHTS do not show which detail is real, so
-    the net processes their maps at full resolution: more than MOST_PIXELS, but once instead of in all turns.
+    The network is one refinement net or two, on their device, and `precision` the number format of
+    the convolutions. The results of `turns` quarter turns of the map are averaged; adding mirror
+    images does not help. With a margin of the net's `reach`, tiles change nothing. Captures of
+    fewer than FEWEST_LIGHTS do not show which detail is real, so the net processes their maps at
+    full resolution: more than MOST_PIXELS, but once instead of in all turns.
     """
 
     network: RefineNet
@@ -97,32 +118,57 @@ class NetworkRefiner:
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
-        They are the estimator's, in the capture's frame; see networks/li_ne_net.py for the distributions. A pixel that
-        is dark under every light stays as it is. The mask (H, W) has P true pixels. Only the brightness of the
-        observations (P, F) is used here: `lighting_at` gives the observations and the light directions of some pixels.
-        `progress` is called after each tile with the number of its pixels.
+        They are the estimator's, in the capture's frame; see networks/li_ne_net.py for the
+        distributions. A pixel that is dark under every light stays as it is. The mask (H, W) has P
+        true pixels. Only the brightness of the observations (P, F) is used here: `lighting_at`
+        gives the observations and the light directions of some pixels. `progress` is called after
+        each tile with the number of its pixels.
         """
         middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
-        of_whole = brightness(torch.from_numpy(observations)), alternating_signs(self._tensor(middle).view(-1, 3))
-        self._refine(_Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole), progress)
+        of_whole = (
+            brightness(torch.from_numpy(observations)),
+            alternating_signs(self._tensor(middle).view(-1, 3)),
+        )
+        self._refine(
+            _Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole),
+            progress,
+        )
 
     def _refine(self, capture: _Capture, progress: Progress = ignore) -> None:
-        half, turns, margin, whole = None, self.turns, self.margin, (capture.normals, capture.errors)
+        half, turns, margin, whole = (
+            None,
+            self.turns,
+            self.margin,
+            (capture.normals, capture.errors),
+        )
         if len(capture.normals) > self.most_pixels:
             turns = 1
             if len(capture.signs) >= FEWEST_LIGHTS:
                 half = HalfCapture.of(capture.mask, capture.lighting_at, *whole, capture.reference)
-                margin, of_half = _DETAIL_MARGIN, (half.observations, half.lighting_at, half.normals, half.errors)
-                self._refine(_Capture(around_object(half.mask), *of_half, capture.reference, capture.signs))
-        lit = (torch.from_numpy(capture.observations).amax(dim=1) > 0).numpy()  # NumPy takes ten times as long
+                margin, of_half = (
+                    _DETAIL_MARGIN,
+                    (half.observations, half.lighting_at, half.normals, half.errors),
+                )
+                self._refine(
+                    _Capture(around_object(half.mask), *of_half, capture.reference, capture.signs)
+                )
+        lit = (
+            torch.from_numpy(capture.observations).amax(dim=1) > 0
+        ).numpy()  # NumPy takes ten times as long
         above = Band(slice(0, 0), *whole)
 
         def refine(tile: Tile) -> tuple[PixelIndices, Floats, Floats]:
             inside = tile.mask[tile.inner]
             own = tile.rows[tile.inner][inside]
             seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
-            maps = self._see(capture, tile, seen, turns) if half is None else self._enlarge(capture, tile, seen, half)
-            refined, errors = (values[:, *inner].permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
+            maps = (
+                self._see(capture, tile, seen, turns)
+                if half is None
+                else self._enlarge(capture, tile, seen, half)
+            )
+            refined, errors = (
+                values[:, *inner].permute(1, 2, 0).cpu().numpy()[inside] for values in maps
+            )
             _turn_back(refined, own, capture.lighting_at)
             return own, refined, errors
 
@@ -136,13 +182,16 @@ class NetworkRefiner:
                 known = lit[own]
                 band.put(own[known], refined[known], errors[known])
                 progress(len(own))
-            # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.
+            # These tiles needed the pixels above as they were. The tiles below need these tiles'
+            # pixels.
             above.write()
             above = band
         above.write()
 
     def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
-        """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged over rotations."""
+        """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged
+        over rotations.
+        """
 
         def features_of(rows: PixelIndices, light: PixelLighting, _: slice) -> torch.Tensor:
             return refine_features(
@@ -161,17 +210,23 @@ class NetworkRefiner:
             features = features[:, *seen]
             estimated = features[channels("normal")]
             least_squares = estimated + features[channels("plain")]
-            normals = restore_detail(normals, estimated, least_squares, features[channels("noise")], mask[:, *seen])
+            normals = restore_detail(
+                normals, estimated, least_squares, features[channels("noise")], mask[:, *seen]
+            )
         return normals, errors
 
     def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's, with detail."""
+        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's,
+        with detail.
+        """
         smooth, errors = half.enlarged(tile.box)
         inside = smooth[:, torch.from_numpy(tile.mask)].T.numpy()
         errors = errors[:, *seen].to(self._device)
 
         def values_of(rows: PixelIndices, light: PixelLighting, part: slice) -> torch.Tensor:
-            normals = (light.in_frame_of_pixels(values) for values in (inside[part], capture.normals[rows]))
+            normals = (
+                light.in_frame_of_pixels(values) for values in (inside[part], capture.normals[rows])
+            )
             observations, directions = map(self._tensor, (light.observations, light.directions))
             scale = map_scale(observations)
             fit = two_halves(observations / scale, directions, capture.signs)
@@ -181,7 +236,9 @@ class NetworkRefiner:
         maps = self._maps(tile, 11, capture.lighting_at, values_of)[:, *seen]
         smooth, estimated, least_squares, noise, largest = torch.split(maps, [3, 3, 3, 1, 1])
         mask = self._tensor(tile.mask)[None, *seen]
-        return restore_octave(unit_maps(smooth), estimated, least_squares, noise, largest, mask), errors
+        return restore_octave(
+            unit_maps(smooth), estimated, least_squares, noise, largest, mask
+        ), errors
 
     def _maps(
         self,
@@ -192,22 +249,34 @@ class NetworkRefiner:
     ) -> torch.Tensor:
         """Return maps (columns, h, w), zero outside the mask, of a tile's values (N, columns).
 
-        `values_of` gives them from rows of the capture, their light and their slice of the tile's pixels.
+        `values_of` gives them from rows of the capture, their light and their slice of the tile's
+        pixels.
         """
         maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
-        rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
+        rows, places = (
+            tile.rows[tile.mask],
+            torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device),
+        )
         for start in range(0, len(rows), LIT_AT_ONCE):
             part = slice(start, start + LIT_AT_ONCE)
-            maps.view(-1, columns)[places[part]] = values_of(rows[part], lighting_at(rows[part]), part)
+            maps.view(-1, columns)[places[part]] = values_of(
+                rows[part], lighting_at(rows[part]), part
+            )
         return maps.permute(2, 0, 1)
 
-    def _average_turns(self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int) -> Maps:
-        """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the turns of the map."""
+    def _average_turns(
+        self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int
+    ) -> Maps:
+        """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the
+        turns of the map.
+        """
         normals = errors = torch.zeros((), device=mask.device)
         for turn in map(Turn, range(turns)):
             turned, turned_mask = turn_features(features, turn), turn_maps(mask, turn)
             part = turned_part(wanted, mask.shape[-2:], turn.quarters)
-            with torch.autocast(mask.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+            with torch.autocast(
+                mask.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
+            ):
                 found, found_errors = self.network(turned[None], turned_mask[None], part)
             normals = normals + turn_maps(found[0], turn.back, vectors=((0, 1),))
             errors = errors + turn_maps(found_errors[0], turn.back)
@@ -222,7 +291,9 @@ class NetworkRefiner:
 
 
 def _turn_back(normals: Floats, rows: PixelIndices, lighting_at: LightingAt) -> None:
-    """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
+    """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in
+    place.
+    """
     for start in range(0, len(rows), LIT_AT_ONCE):
         part = slice(start, start + LIT_AT_ONCE)
         light = lighting_at(rows[part])
@@ -232,7 +303,9 @@ def _turn_back(normals: Floats, rows: PixelIndices, lighting_at: LightingAt) -> 
 
 
 def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
-    """Return a part of a map of this shape with all pixels that its detail depends on, and where the part is in it."""
+    """Return a part of a map of this shape with all pixels that its detail depends on, and where
+    the part is in it.
+    """
 
     def grow(side: slice, length: int) -> tuple[slice, slice]:
         start, stop, _ = side.indices(length)

@@ -18,13 +18,15 @@ class Tile:
     """A part of the map with a margin."""
 
     box: Box  # where it is in the map, with the margin
-    mask: NDArray[np.bool_]  # (h, w), of the box; multiples of COARSEST, so that a rotated tile has the same cells
+    # (h, w), of the box; multiples of COARSEST, so that a rotated tile has the same cells
+    mask: NDArray[np.bool_]
     rows: NDArray[np.integer]  # (h, w), the rows of its pixels in the capture
     inner: Part  # the part of the box without the margin
 
 
 class Band:
-    """The refined normals and errors of a row of tiles, until the tiles below no longer need those from before.
+    """The refined normals and errors of a row of tiles, until the tiles below no longer need those
+    from before.
 
     The pixels follow one another in the capture, of which the normals (P, 3) and errors (P, 2) are.
     """
@@ -44,10 +46,13 @@ class Band:
             whole[self._pixels] = kept
 
 
-def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[tuple[slice, Iterator[Tile]]]:
+def rows_of_tiles(
+    mask: NDArray[np.bool_], tile: int, margin: int
+) -> Iterator[tuple[slice, Iterator[Tile]]]:
     """Yield the pixels of each row of tiles, and its tiles that have pixels.
 
-    The sides of the mask (H, W) and of a tile, and the context around it, are multiples of COARSEST.
+    The sides of the mask (H, W) and of a tile, and the context around it, are multiples of
+    COARSEST.
     """
     above = pixels_before(mask)
     for top in range(0, mask.shape[0], tile):
@@ -56,11 +61,21 @@ def rows_of_tiles(mask: NDArray[np.bool_], tile: int, margin: int) -> Iterator[t
         band = slice(max(0, top - margin), min(top + tile + margin, len(mask)))
         rows = mask[band].cumsum(dtype=np.int32).reshape(mask[band].shape)
         rows += int(above[band.start]) - 1
-        yield pixels, _tiles_of_band(mask[band], rows, band, slice(top - band.start, bottom - band.start), tile, margin)
+        yield (
+            pixels,
+            _tiles_of_band(
+                mask[band], rows, band, slice(top - band.start, bottom - band.start), tile, margin
+            ),
+        )
 
 
 def _tiles_of_band(
-    mask: NDArray[np.bool_], rows: NDArray[np.integer], band: slice, inside: slice, tile: int, margin: int
+    mask: NDArray[np.bool_],
+    rows: NDArray[np.integer],
+    band: slice,
+    inside: slice,
+    tile: int,
+    margin: int,
 ) -> Iterator[Tile]:
     for left in range(0, mask.shape[1], tile):
         outer = slice(max(0, left - margin), min(left + tile + margin, mask.shape[1]))
@@ -70,23 +85,34 @@ def _tiles_of_band(
 
 
 def pixels_before(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return how many pixels of a mask (H, W) are above each of its rows, and in all of them (H + 1,)."""
+    """Return how many pixels of a mask (H, W) are above each of its rows, and in all of them (H +
+    1,).
+    """
     return np.concatenate(([0], np.count_nonzero(mask, axis=1).cumsum()))
 
 
 def around_object(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the part of a mask that has pixels, between multiples of COARSEST. Behind the map it has a margin."""
+    """Return the part of a mask that has pixels, between multiples of COARSEST. Behind the map it
+    has a margin.
+    """
     bounds = []
     for axis in (1, 0):
         places = np.flatnonzero(mask.any(axis=axis))
-        bounds.append(slice(places[0] // COARSEST * COARSEST, -(-(places[-1] + 1) // COARSEST) * COARSEST))
+        bounds.append(
+            slice(places[0] // COARSEST * COARSEST, -(-(places[-1] + 1) // COARSEST) * COARSEST)
+        )
     part = mask[tuple(bounds)]
-    missing = [(0, side.stop - side.start - length) for side, length in zip(bounds, part.shape, strict=True)]
+    missing = [
+        (0, side.stop - side.start - length)
+        for side, length in zip(bounds, part.shape, strict=True)
+    ]
     return np.pad(part, missing)
 
 
 def turned_part(part: Part, shape: tuple[int, ...], quarters: int) -> Part:
-    """Return where a part of a map of this shape is after a counterclockwise rotation by `quarters` quarter turns."""
+    """Return where a part of a map of this shape is after a counterclockwise rotation by `quarters`
+    quarter turns.
+    """
     rows, columns = (slice(*side.indices(length)) for side, length in zip(part, shape, strict=True))
     height, width = shape
     for _ in range(quarters):

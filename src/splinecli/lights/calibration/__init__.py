@@ -1,1 +1,3 @@
-"""Calibration of lights: directions from images of mirror balls, intensities from images of a gray target."""
+"""Calibration of lights: directions from images of mirror balls, intensities from images of a gray
+target.
+"""

@@ -1,9 +1,10 @@
-"""Light directions from folders of images of mirror balls: the camera, the highlights, and the balls together.
+"""Light directions from folders of images of mirror balls: the camera, the highlights, and the
+balls together.
 
-The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at the highlight halves
-the angle between the light direction l and the direction v to the camera, so l = 2 (n.v) n - v. A common mistake is to
-use n itself as the light direction. The camera is at the origin, and the unit of length is the
-radius of the ball. x is right, y up, z towards the camera.
+The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at
+the highlight halves the angle between the light direction l and the direction v to the camera, so l
+= 2 (n.v) n - v. A common mistake is to use n itself as the light direction. The camera is at the
+origin, and the unit of length is the radius of the ball. x is right, y up, z towards the camera.
 """
 
 import math
@@ -18,7 +19,13 @@ import numpy as np
 
 from splinecli.capture import files as capture_files
 from splinecli.capture.formats.facts import ImageHeader, read_header
-from splinecli.capture.formats.images import ExpectedSize, decode_image, read_image, read_mask, to_linear
+from splinecli.capture.formats.images import (
+    ExpectedSize,
+    decode_image,
+    read_image,
+    read_mask,
+    to_linear,
+)
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.capture.source import Progress
 from splinecli.errors import InputError
@@ -27,9 +34,19 @@ from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import ray_basis
 
-DISTANT = 1e6  # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly parallel
-SHORTEST_LENS = 0.7  # of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
-_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405  # tags of EXIF
+# focal length, in pixels, from which a camera is treated as distant: all its rays are nearly
+# parallel
+DISTANT = 1e6
+# of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
+SHORTEST_LENS = 0.7
+# tags of EXIF
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (
+    0x920A,
+    0xA002,
+    0xA20E,
+    0xA210,
+    0xA405,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +69,8 @@ class View:
             nearest = self.shortest / float(matrix[0, 0])
             matrix[:2, :2] *= nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
-            # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing changes them.
+            # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing
+            # changes them.
             matrix[:2, :2] *= math.exp(0.05 * generator.normal())
         return matrix
 
@@ -63,7 +81,8 @@ def unit_rays(points: Float64Array, matrix: Float64Array) -> Float64Array:
 
 
 def find_view(image: ImageHeader, matrix: Path | None) -> View:
-    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
+    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a
+    distant one.
 
     Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
     """
@@ -82,7 +101,11 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
     millimetres = {2: 25.4, 3: 10.0}  # of an inch and of a centimetre, by EXIF's numbers of units
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in millimetres:
-            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / millimetres[tags.get(_UNIT, 2)]
+            pixels = (
+                float(tags[_FOCAL_LENGTH])
+                * float(tags[_RESOLUTION])
+                / millimetres[tags.get(_UNIT, 2)]
+            )
             pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
         else:
             pixels = float(tags[_FILM]) / math.hypot(36, 24) * math.hypot(width, height)
@@ -91,7 +114,8 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
     return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
 
 
-_HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
+# a highlight is the patch above this share of its brightest value, after a slight blur
+_HIGHLIGHT_LEVEL = 0.7
 
 
 @dataclass(frozen=True)
@@ -117,30 +141,44 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     # The blur removes bright single pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    if brightest <= 4.0 * median or brightest <= 0:  # smallest ratio of the highlight to the median of the ball
-        hint = "Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the lamp"
-        raise InputError("found no highlight in the ball", hint=f"{hint} must be by far the brightest spot in the ball")
+    if (
+        brightest <= 4.0 * median or brightest <= 0
+    ):  # smallest ratio of the highlight to the median of the ball
+        hint = (
+            "Is this a folder of images of a mirror ball? If so, take the images with all other"
+            " lights off: the lamp"
+        )
+        raise InputError(
+            "found no highlight in the ball",
+            hint=f"{hint} must be by far the brightest spot in the ball",
+        )
     _, labels = cv2.connectedComponents((smooth >= _HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
-    # Of several patches, take the one with the most light rather than the one with the brightest pixel.
+    # Of several patches, take the one with the most light rather than the one with the brightest
+    # pixel.
     light = np.bincount(labels.ravel(), weights=smooth.ravel())
     light[0] = 0
     core = labels == light.argmax()
     y, x = np.nonzero(core)
     width = max(np.ptp(x), np.ptp(y))
-    if width > 0.3 * 2 * circle.radius:  # a wider patch is a window or an overexposed ball, not a lamp
+    if (
+        width > 0.3 * 2 * circle.radius
+    ):  # a wider patch is a window or an overexposed ball, not a lamp
         problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
         raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
-    # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
+    # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its
+    # shape.
     weight = smooth[core].astype(np.float64) - 0.9 * _HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
-    return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
+    return Highlight(
+        float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated
+    )
 
 
 def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
     """Return the centre (3,) of a ball whose outline is at these image points (N, 2) of a camera.
 
-    Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
-    linear. Written with m_z + 1, it is also exact for a camera that is far away.
+    Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2
+    - 1), this is linear. Written with m_z + 1, it is also exact for a camera that is far away.
     """
     x, y, _ = (np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)).T
     equations = np.column_stack((x, y, np.ones(len(x))))
@@ -155,8 +193,12 @@ def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
     return np.asarray(np.array((mx, my, -1 - beyond)) / np.sqrt(max(inverse, 1e-30)))
 
 
-def reflect(centre: Float64Array, highlights: Float64Array, matrix: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside the ball."""
+def reflect(
+    centre: Float64Array, highlights: Float64Array, matrix: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside
+    the ball.
+    """
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
     with np.errstate(invalid="ignore"):
@@ -192,7 +234,8 @@ class BallCalibration:
     circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
     highlights: tuple[Highlight, ...]  # (F,), one for each image
     directions: Float64Array  # (F, 3) float64, unit vectors; x right, y up, z to the camera
-    normals: Float64Array  # (F, 3), of the ball at the highlights, half-way between the view and the lights
+    # (F, 3), of the ball at the highlights, half-way between the view and the lights
+    normals: Float64Array
     view: View
     shape: tuple[int, ...]  # (H, W) of the images
 
@@ -208,22 +251,34 @@ class CalibratedLights:
 
     balls: tuple[BallCalibration, ...]
     directions: Float64Array  # (F, 3) float64, unit vectors: the mean direction of the balls
-    disagreement_deg: Float64Array  # (F,), largest angle between a ball's direction and the mean; 0 for one ball
+    # (F,), largest angle between a ball's direction and the mean; 0 for one ball
+    disagreement_deg: Float64Array
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
-    """Return the files of the ball in a folder, with images in natural order or in the order of filenames.txt.
+    """Return the files of the ball in a folder, with images in natural order or in the order of
+    filenames.txt.
 
-    A mask that is given replaces the one in the folder. Raises InputError if the folder has no images.
+    A mask that is given replaces the one in the folder. Raises InputError if the folder has no
+    images.
     """
-    not_lights, leave_out = capture_files.NOT_PHOTOGRAPHS | set(REFERENCES), () if mask is None else (mask,)
-    images, listed = capture_files.find_images(folder, leave_out_stems=not_lights, leave_out=leave_out)
-    if not listed and 2 * sum(map(capture_files.is_mask_name, images)) < len(images):  # such as chrome.mask.tga
+    not_lights, leave_out = (
+        capture_files.NOT_PHOTOGRAPHS | set(REFERENCES),
+        () if mask is None else (mask,),
+    )
+    images, listed = capture_files.find_images(
+        folder, leave_out_stems=not_lights, leave_out=leave_out
+    )
+    if not listed and 2 * sum(map(capture_files.is_mask_name, images)) < len(
+        images
+    ):  # such as chrome.mask.tga
         images = tuple(image for image in images if not capture_files.is_mask_name(image))
     others = capture_files.list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
     mask = mask or capture_files.find_named(folder, capture_files.MASK)
-    return BallFiles(folder, images, reference, mask or capture_files.choose_mask(folder, images)[0])
+    return BallFiles(
+        folder, images, reference, mask or capture_files.choose_mask(folder, images)[0]
+    )
 
 
 def calibrate_ball(
@@ -233,16 +288,17 @@ def calibrate_ball(
     camera_matrix: Path | None = None,
     progress: Progress = lambda: None,
 ) -> BallCalibration:
-    """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
+    """Find the outline, the highlights and the light directions of one ball. Only one image is in
+    memory at a time.
 
     Args:
-        circle: the outline. None takes it from the mask, from the reference image, or from the mean of all images, in
-            this order.
+        circle: the outline. None takes it from the mask, from the reference image, or from the mean
+            of all images, in this order.
         camera_matrix: a file; None takes the camera from EXIF, or as distant (see find_view).
 
     Raises:
-        InputError: an image cannot be read, has another size or shows no highlight; or the outline is not found or
-            not entirely inside the image.
+        InputError: an image cannot be read, has another size or shows no highlight; or the outline
+            is not found or not entirely inside the image.
     """
     circle, circle_from = _find_outline(files) if circle is None else (circle, "--circle")
     view = find_view(files.facts[0], camera_matrix)
@@ -252,15 +308,24 @@ def calibrate_ball(
     for path in files.images:
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
-            raise InputError("the circle is outside the image", path=path, hint="--circle is X,Y,R in pixels")
+            raise InputError(
+                "the circle is outside the image", path=path, hint="--circle is X,Y,R in pixels"
+            )
         try:
             full_scale = 1.0 if stored.dtype.kind == "u" else None
-            highlight = find_highlight(to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale)
+            highlight = find_highlight(
+                to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale
+            )
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
             if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
-                problem = "the highlight is near the rim of the ball: the lamp is level with the ball or behind it"
-                raise InputError(problem, hint="Place all lights on the camera's side of the object")
+                problem = (
+                    "the highlight is near the rim of the ball: the lamp is level with the ball or"
+                    " behind it"
+                )
+                raise InputError(
+                    problem, hint="Place all lights on the camera's side of the object"
+                )
         except InputError as error:
             raise InputError(error.problem, path=path, hint=error.hint) from None
         highlights.append(highlight)
@@ -272,7 +337,9 @@ def calibrate_ball(
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers of images."""
+    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers
+    of images.
+    """
     if len({len(ball.directions) for ball in balls}) > 1:
         counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)
         hint = "Every ball needs one image for each light, in the same order"
@@ -301,7 +368,12 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     except InputError as error:
         raise InputError(error.problem, path=error.path or path, hint=error.hint) from None
     if circle.reaches_beyond(shape):
-        ball = f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
-        hint = "Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R"
+        ball = (
+            f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
+        )
+        hint = (
+            "Take images of the whole ball; if this is not the ball, give its circle with --circle"
+            " X,Y,R"
+        )
         raise InputError(f"{ball} is not entirely inside the image", path=path, hint=hint)
     return circle, source

@@ -1,6 +1,7 @@
 """The outline of a ball: a circle from a mask or from an image, with measures of its quality.
 
-Coordinates are in pixels of the image: x right, y down, whole numbers at pixel centres, (0, 0) the top left pixel.
+Coordinates are in pixels of the image: x right, y down, whole numbers at pixel centres, (0, 0) the
+top left pixel.
 """
 
 import math
@@ -15,9 +16,12 @@ from splinecli.maths.normals import unit
 
 _ANGLES = np.arange(720) * (2 * np.pi / 720)
 _RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
-_MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
-_SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
-_TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it
+# Smallest visible share of an outline. A shorter arc may be the edge of another object.
+_MIN_VISIBLE = 0.35
+# of the radius: the distance to either side of the guess in which edges are searched
+_SEARCH_BAND = 0.06
+# of the radius: the largest distance from the circle at which a point agrees with it
+_TOLERANCE = 0.015
 
 
 @dataclass(frozen=True)
@@ -29,17 +33,24 @@ class Circle:
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
     visible: float = 1.0  # share of the outline that the image or mask shows, 0 to 1
-    points: Float64Array | None = field(default=None, repr=False, compare=False)  # (N, 2), of the outline
+    # (N, 2), of the outline
+    points: Float64Array | None = field(default=None, repr=False, compare=False)
 
     @property
     def outline(self) -> Float64Array:
-        """The points (N, 2) of the outline near the circle. A near camera shows an ellipse instead of a circle."""
+        """The points (N, 2) of the outline near the circle. A near camera shows an ellipse instead
+        of a circle.
+        """
         if self.points is not None:
-            return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
+            return self.points[
+                _distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius
+            ]
         return (self.x, self.y) + self.radius * _RAYS
 
     def normals(self, x: Float64Array, y: Float64Array) -> Float64Array:
-        """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
+        """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the
+        circle.
+        """
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
             return np.stack((nx, ny, np.sqrt(1 - nx * nx - ny * ny)), axis=-1)
@@ -70,12 +81,18 @@ def circle_from_mask(mask: Bools) -> Circle:
     if len(outline) < 12:
         raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
-    # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
+    # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel
+    # further.
     outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < _MIN_VISIBLE:
-        problem = f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a ball"
-        raise InputError(problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R")
+        problem = (
+            f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
+            " ball"
+        )
+        raise InputError(
+            problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R"
+        )
     return circle
 
 
@@ -85,7 +102,8 @@ def find_circle(image: Array) -> Circle:
     Raises InputError if no clear circle is found.
     """
     values = image.astype(np.float32)
-    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
+    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings
+    # out its edge.
     values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
     scale = 480 / max(values.shape)  # the Hough transform searches an image of this longer side
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -106,26 +124,37 @@ def find_circle(image: Array) -> Circle:
         )
         # The best circles of the Hough transform are refined.
         for x, y, radius in found[0, :12].tolist() if found is not None else ():
-            # Pixel centres are at whole numbers in both images, so their corners differ by half a pixel.
-            circle = _refine(values, Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale))
-            # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is the ball.
+            # Pixel centres are at whole numbers in both images, so their corners differ by half a
+            # pixel.
+            circle = _refine(
+                values, Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
+            )
+            # Reflections in the ball are circles, too. Of two equally visible circles, the larger
+            # one is the ball.
             merit = 0.0 if circle is None else circle.visible * math.sqrt(circle.radius)
             if merit > highest:
                 best, highest = circle, merit
     if best is None:
-        hint = "Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its circle"
+        hint = (
+            "Is this a folder of images of a mirror ball? If so, give a mask of the ball with"
+            " --mask, or its circle"
+        )
         raise InputError("found no circle, expected a ball", hint=f"{hint} with --circle X,Y,R")
     return best
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
-    """Return the circle through the strongest edges along rays from the guess's centre; None if too few agree."""
+    """Return the circle through the strongest edges along rays from the guess's centre; None if too
+    few agree.
+    """
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
         steps = np.arange(guess.radius - half, guess.radius + half, 0.5)
         places = (guess.x, guess.y) + _RAYS[:, None] * steps[:, None]
         x, y = np.moveaxis(places.astype(np.float32), -1, 0)
-        sampled = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+        sampled = cv2.remap(
+            values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
+        )
         smooth = cv2.GaussianBlur(sampled, (9, 1), 2)
         edge = np.abs(smooth[:, 2:] - smooth[:, :-2])
         edge[~np.isfinite(edge)] = 0
@@ -145,7 +174,8 @@ def _refine(values: Float32Array, guess: Circle) -> Circle | None:
 
 
 def _fit(points: Float64Array, *, outline_points: int) -> Circle:
-    """Return the circle through most of the points (N, 2); a complete outline would have `outline_points`.
+    """Return the circle through most of the points (N, 2); a complete outline would have
+    `outline_points`.
 
     RANSAC with samples of three points, then least squares over the points close to the circle.
     """
@@ -158,7 +188,10 @@ def _fit(points: Float64Array, *, outline_points: int) -> Circle:
         if abs(twice_area) < 1e-9:
             continue
         b2, c2 = (bx - ax) ** 2 + (by - ay) ** 2, (cx - ax) ** 2 + (cy - ay) ** 2
-        x, y = ((cy - ay) * b2 - (by - ay) * c2) / twice_area, ((bx - ax) * c2 - (cx - ax) * b2) / twice_area
+        x, y = (
+            ((cy - ay) * b2 - (by - ay) * c2) / twice_area,
+            ((bx - ax) * c2 - (cx - ax) * b2) / twice_area,
+        )
         circle = ax + x, ay + y, math.hypot(x, y)
         if 0.2 * size < circle[2] < 3 * size:
             agreeing = int(np.count_nonzero(_distance(points, circle) < _TOLERANCE * circle[2]))
@@ -170,7 +203,8 @@ def _fit(points: Float64Array, *, outline_points: int) -> Circle:
         close_by = points[_distance(points, best) < _TOLERANCE * best[2]]
         if len(close_by) < 3:
             break
-        # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). Centring the points keeps it accurate.
+        # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). Centring the points keeps it
+        # accurate.
         middle = close_by.mean(axis=0)
         around = close_by - middle
         terms = np.column_stack((2 * around, np.ones(len(around))))

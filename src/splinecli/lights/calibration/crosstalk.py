@@ -1,4 +1,6 @@
-"""Crosstalk of three coloured lamps that light a matte gray ball at once: how much of each lamp a channel shows."""
+"""Crosstalk of three coloured lamps that light a matte gray ball at once: how much of each lamp a
+channel shows.
+"""
 
 from __future__ import annotations
 
@@ -23,24 +25,35 @@ _MOST_PIXELS, _MIN_PIXELS, _FITS = 1 << 16, 50, 10
 
 
 def measure_crosstalk(
-    files: BallFiles, light_directions: Float64Array, *, radiometry: RadiometricCalibration = AS_STORED
+    files: BallFiles,
+    light_directions: Float64Array,
+    *,
+    radiometry: RadiometricCalibration = AS_STORED,
 ) -> Float64Array:
-    """Return crosstalk matrices (N, 3, 3), with a mean diagonal of 1, from N colour images of a matte gray ball.
+    """Return crosstalk matrices (N, 3, 3), with a mean diagonal of 1, from N colour images of a
+    matte gray ball.
 
-    Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l, 0), over the pixels that are not saturated.
+    Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l, 0), over the pixels that
+    are not saturated.
 
     Args:
         files: colour images of the ball under all three lamps, and its mask.
         light_directions: (3 N, 3), unit, three for each image in the order R, G, B.
 
     Raises:
-        InputError: the numbers of images and lights differ, an image cannot be read, is gray or saturated, or the
-            channels do not separate the lamps.
+        InputError: the numbers of images and lights differ, an image cannot be read, is gray or
+            saturated, or the channels do not separate the lamps.
     """
     count = len(files.images)
     if CHANNELS * count != len(light_directions):
-        problem = f"found {count} colour images of the gray ball and {len(light_directions)} lights, expected three"
-        hint = "For each colour image, photograph the mirror ball under each lamp alone, in the order R, G, B"
+        problem = (
+            f"found {count} colour images of the gray ball and {len(light_directions)} lights,"
+            " expected three"
+        )
+        hint = (
+            "For each colour image, photograph the mirror ball under each lamp alone, in the order"
+            " R, G, B"
+        )
         raise InputError(f"{problem} lights for each image", path=files.folder, hint=hint)
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
     check_exposures(files.facts)
@@ -53,7 +66,9 @@ def measure_crosstalk(
     )
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.intp)
     matrices = []
-    for number, image in enumerate(capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)):
+    for number, image in enumerate(
+        capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)
+    ):
         saturated = np.zeros(len(normals), np.bool_)
         saturated[image.find_saturated(None).saturated] = True
         lights = light_directions[CHANNELS * number : CHANNELS * number + CHANNELS]
@@ -75,7 +90,9 @@ def _fit(values: Floats, cosines: Float64Array, known: Bools, path: Path) -> Flo
         for _ in range(_FITS):
             weighted = shading * weights[:, None]
             row = np.linalg.lstsq(weighted.T @ shading, weighted.T @ channel, rcond=None)[0]
-            weights = 1 / (np.abs(channel - shading @ row) + 0.02 * max(float(channel.max()), 1e-12))
+            weights = 1 / (
+                np.abs(channel - shading @ row) + 0.02 * max(float(channel.max()), 1e-12)
+            )
         rows.append(row)
     matrix = np.stack(rows)
     check_crosstalk(matrix, path)

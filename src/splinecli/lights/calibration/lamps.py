@@ -1,8 +1,10 @@
-"""Intensities of lamps from a gray target, positions of near ones from several balls, and the report of a calibration.
+"""Intensities of lamps from a gray target, positions of near ones from several balls, and the
+report of a calibration.
 
-Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from the highlight on
-its surface in the direction of the lamp. The balls' centres, which follow from the size of their outlines, are near a
-plane z = const, and the object's mean plane should be that plane.
+Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from
+the highlight on its surface in the direction of the lamp. The balls' centres, which follow from the
+size of their outlines, are near a plane z = const, and the object's mean plane should be that
+plane.
 """
 
 import math
@@ -36,17 +38,22 @@ Target = Literal["ball", "card"]
 
 
 def measure_light_intensities(
-    files: BallFiles, light_directions: Float64Array, target: Target, *, radiometry: RadiometricCalibration = AS_STORED
+    files: BallFiles,
+    light_directions: Float64Array,
+    target: Target,
+    *,
+    radiometry: RadiometricCalibration = AS_STORED,
 ) -> Float64Array:
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
-    By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
-    pixels are found as in a capture. Raises InputError if the numbers of images and lights differ, an image cannot be
-    read or has another size, or the target is dark or saturated under a light.
+    By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are
+    read and saturated pixels are found as in a capture. Raises InputError if the numbers of images
+    and lights differ, an image cannot be read or has another size, or the target is dark or
+    saturated under a light.
 
     Args:
-        files: one image of the target for each light, and a mask of the target. A card without a mask fills the image.
-            An image called `ambient` in the folder is subtracted.
+        files: one image of the target for each light, and a mask of the target. A card without a
+            mask fills the image. An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
     """
@@ -70,25 +77,32 @@ def measure_light_intensities(
         values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
-    smallest = 0.35  # n.l of the pixels that are used: closer to grazing light, a matte ball is seldom Lambertian
+    # n.l of the pixels that are used: closer to grazing light, a matte ball is seldom Lambertian
+    smallest = 0.35
     intensities = np.empty((n_lights, 3))
     for position, path in enumerate(files.images):
         ratios = values[position] / np.maximum(cosines[:, position], smallest)[:, None]
         if saturated is not None:
-            # A card is alike everywhere: saturated pixels are its brightest, and do not shift the median. On a ball,
-            # they are where n.l is largest, and the other pixels give the same intensity without them.
+            # A card is alike everywhere: saturated pixels are its brightest, and do not shift the
+            # median. On a ball, they are where n.l is largest, and the other pixels give the same
+            # intensity without them.
             ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
         ratios = ratios[(cosines[:, position] > smallest) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= 50 else np.zeros(1)
         if not ((intensity > 0) & np.isfinite(intensity)).all():
-            problem = "the target is dark or overexposed under this light, so the light's intensity is unknown"
+            problem = (
+                "the target is dark or overexposed under this light, so the light's intensity is"
+                " unknown"
+            )
             hint = "Every light needs an image of the target that is neither black nor saturated"
             raise InputError(problem, path=path, hint=hint)
         intensities[position] = intensity
     return np.asarray(intensities / intensities.mean())
 
 
-def target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> tuple[Bools, Float64Array]:
+def target_normals(
+    files: BallFiles, shape: tuple[int, ...], target: Target
+) -> tuple[Bools, Float64Array]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
     mask = np.ones(shape, np.bool_)
     if files.mask is not None:
@@ -96,7 +110,9 @@ def target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> 
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:
-        raise InputError("the images of the gray ball need a mask", path=files.folder, hint="Add one as mask.png")
+        raise InputError(
+            "the images of the gray ball need a mask", path=files.folder, hint="Add one as mask.png"
+        )
     circle = circle_from_mask(mask)
     # Pixels at the rim mix the ball with the background.
     mask &= Circle(circle.x, circle.y, 0.97 * circle.radius).inside(shape)
@@ -104,31 +120,39 @@ def target_normals(files: BallFiles, shape: tuple[int, ...], target: Target) -> 
     return mask, circle.normals(x.astype(np.float64), y.astype(np.float64))
 
 
-_PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
+# standard deviation of highlights, and of the middle and the radius of outlines, in pixels
+_PIXEL_ERROR = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
-    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
+    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the
+    balls' plane.
+    """
 
     positions: Float64Array  # (F, 3)
     uncertainty: Float64Array  # (F,), the distance within which 95 % of the true positions are
-    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
+    # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
+    pixel_size: float
     view: View
 
     @property
     def known(self) -> bool:
         """Whether every lamp has a position in front of the balls that the rays determine well."""
-        # With a larger uncertainty the rays are nearly parallel, and the lamp may be at any distance.
+        # With a larger uncertainty the rays are nearly parallel, and the lamp may be at any
+        # distance.
         most = 0.4 * np.linalg.norm(self.positions, axis=1)
         return bool((self.positions[:, 2] > 0).all() and (self.uncertainty <= most).all())
 
 
-def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
-    """Return the positions of the lamps from balls photographed by one camera; None for balls at one place.
+def triangulate_lamps(
+    balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
+) -> LampPositions | None:
+    """Return the positions of the lamps from balls photographed by one camera; None for balls at
+    one place.
 
-    The uncertainty comes from repeating the computation with other pixels, heights of the balls and cameras
-    (View.draw). It is larger if the rays miss each other by more than this explains.
+    The uncertainty comes from repeating the computation with other pixels, heights of the balls and
+    cameras (View.draw). It is larger if the rays miss each other by more than this explains.
 
     Args:
         balls: at least two balls, or one at two places.
@@ -144,7 +168,8 @@ def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float 
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # If _PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors did.
+    # If _PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors
+    # did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
     uncertainty = excess * np.quantile(errors, 0.95, axis=0, method="higher")
@@ -157,7 +182,8 @@ def _positions(
     diameter: float | None,
     errors: np.random.Generator | None = None,
 ) -> tuple[Float64Array, float, float]:
-    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
+    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each
+    other.
 
     `errors` draws errors of the pixels; None takes them as they are.
     """
@@ -165,20 +191,29 @@ def _positions(
     def error(*shape: int) -> Float64Array:
         return np.zeros(shape) if errors is None else errors.normal(size=shape)
 
-    centres = np.array([ball_centre(ball.circle.outline + _PIXEL_ERROR * error(2), matrix) for ball in balls])
+    centres = np.array(
+        [ball_centre(ball.circle.outline + _PIXEL_ERROR * error(2), matrix) for ball in balls]
+    )
     depths = -centres[:, 2]
     shares = np.array([_PIXEL_ERROR / ball.circle.radius for ball in balls])
     plane = float(depths.mean() * (1 + (shares * error(len(balls))).mean()))
-    # The most probable depths, and their errors, given those from the outlines and the usual difference between the
-    # heights of centres, half a radius. It matters under a distant camera, where outlines do not give the heights.
+    # The most probable depths, and their errors, given those from the outlines and the usual
+    # difference between the heights of centres, half a radius. It matters under a distant camera,
+    # where outlines do not give the heights.
     weights = 0.5**2 / (0.5**2 + (shares * depths) ** 2)
-    likely = plane + weights * (depths - depths.mean()) + np.sqrt(weights) * shares * depths * error(len(balls))
+    likely = (
+        plane
+        + weights * (depths - depths.mean())
+        + np.sqrt(weights) * shares * depths * error(len(balls))
+    )
     centres *= (likely / depths)[:, None]
     height, width = balls[0].shape
     origin = np.array(((width - 1) / 2, (height - 1) / 2, 1.0)) @ ray_basis(matrix) * plane
     starts, towards = [], []
     for centre, ball in zip(centres, balls, strict=True):
-        normals, directions = reflect(centre, ball.points + _PIXEL_ERROR * error(*ball.points.shape), matrix)
+        normals, directions = reflect(
+            centre, ball.points + _PIXEL_ERROR * error(*ball.points.shape), matrix
+        )
         starts.append(centre - origin + normals)
         towards.append(directions)
     points, miss = intersect_rays(np.array(starts), np.array(towards))
@@ -188,9 +223,11 @@ def _positions(
 
 
 def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Float64Array, float]:
-    """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays miss them.
+    """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays
+    miss them.
 
-    The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN gives NaN.
+    The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN
+    gives NaN.
     """
     usable = np.isfinite(directions).all(axis=(0, 2))
     points = np.full(starts.shape[1:], np.nan)
@@ -207,7 +244,9 @@ def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Floa
         misses = np.einsum("bfij,bfj->bfi", across, nearest - starts)
         weights = np.maximum(np.linalg.norm(nearest - starts, axis=2), 1e-12) ** -2.0
     points[usable] = nearest
-    return points, float((weights * np.square(misses).sum(axis=2)).mean()) if usable.any() else math.nan
+    return points, float(
+        (weights * np.square(misses).sum(axis=2)).mean()
+    ) if usable.any() else math.nan
 
 
 def calibration_report(
@@ -226,7 +265,9 @@ def calibration_report(
         picture: the name of the picture to which warnings refer.
     """
     single, view = len(lights.balls) == 1, lights.balls[0].view
-    off_deg = None if known_directions is None else angle_between_deg(known_directions, lights.directions)
+    off_deg = (
+        None if known_directions is None else angle_between_deg(known_directions, lights.directions)
+    )
     return {
         "n_lights": len(lights.directions),
         "camera": {"from": view.source, "matrix": _rows(view.matrix) if view.known else None},
@@ -239,7 +280,9 @@ def calibration_report(
                     "seen": _round(ball.circle.visible),
                     "spread": _round(ball.circle.spread),
                 },
-                "highlights": [[_round(highlight.x), _round(highlight.y)] for highlight in ball.highlights],
+                "highlights": [
+                    [_round(highlight.x), _round(highlight.y)] for highlight in ball.highlights
+                ],
                 "saturated": [_round(highlight.saturated) for highlight in ball.highlights],
             }
             for ball in lights.balls
@@ -252,7 +295,9 @@ def calibration_report(
             "known": lamps.known,
             "positions": _rows(lamps.positions),
             # Infinite if a lamp may be at any distance.
-            "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
+            "uncertainty": [
+                _round(value) if np.isfinite(value) else None for value in lamps.uncertainty
+            ],
             "pixel_size": _round(lamps.pixel_size, 6),
         },
         "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg),
@@ -262,18 +307,22 @@ def calibration_report(
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for people: the outlines, and how well balls and compared lights agree."""
+    """Return the lines of a report for people: the outlines, and how well balls and compared lights
+    agree.
+    """
     lines = []
     for ball in report["balls"]:
         circle = ball["circle"]
         lines.append(
-            f"{ball['folder']}: circle {circle['x']:.1f}, {circle['y']:.1f}, radius {circle['radius']:.1f} pixels"
+            f"{ball['folder']}: circle {circle['x']:.1f}, {circle['y']:.1f}, radius"
+            f" {circle['radius']:.1f} pixels"
             f" (from {circle['from']}, {100 * circle['seen']:.0f} % of the outline visible,"
             f" spread {circle['spread']:.1f} pixels)"
         )
     if angles := report["disagreement_deg"]:
         lines.append(
-            f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
+            f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most"
+            f" {angles['largest']:.1f}"
         )
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
@@ -296,8 +345,10 @@ def _warnings(
     lights: CalibratedLights, known: Float64Array | None, picture: str, lamps: LampPositions | None
 ) -> list[str]:
     warnings = [
-        f"{ball.files.folder}: the outline of the ball is uncertain ({100 * ball.circle.visible:.0f} % of it visible,"
-        f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
+        f"{ball.files.folder}: the outline of the ball is uncertain"
+        f" ({100 * ball.circle.visible:.0f} % of it visible,"
+        f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green"
+        " circle is wrong, give --mask or"
         " --circle."
         for ball in lights.balls
         # Less of the outline is visible, or it varies by more than 1 % of the radius.
@@ -305,26 +356,33 @@ def _warnings(
     ]
     if lamps is not None and not lamps.known:
         warnings.append(
-            "The rays from the balls are too parallel to measure the lamps' distances. If the lamps are near, put the"
+            "The rays from the balls are too parallel to measure the lamps' distances. If the"
+            " lamps are near, put the"
             " balls farther apart."
             if lamps.view.known
-            else "The lamps' distances are unknown, because the camera is: it is treated as distant, which makes"
-            " the rays from the balls too parallel if it is near. If the lamps are near, add --camera-matrix."
+            else "The lamps' distances are unknown, because the camera is: it is treated"
+            " as distant, which makes"
+            " the rays from the balls too parallel if it is near. If the lamps are near, add"
+            " --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
     if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
-            f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."
+            f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1}"
+            " (counted from 1)."
             f" Check {picture}."
         )
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
-        from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
+        from_normals = np.mean(
+            [angle_between_deg(known, ball.normals).mean() for ball in lights.balls]
+        )
         # Smaller differences do not indicate a wrong frame.
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
-                "The compared file contains the normals of the ball at the highlights instead of the light directions:"
+                "The compared file contains the normals of the ball at the highlights instead of"
+                " the light directions:"
                 " each is half-way between the view and the light. Use the file written here."
             )
     return warnings

@@ -29,9 +29,9 @@ class CaptureChangedError(OutputError):
 def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
     """Choose an entry name for each capture, and return the folders by name.
 
-    A capture already in the set keeps its name. A new capture is named after its folder, with a number if another
-    capture has that name. Duplicate folders are used only once, because the same pixels must not be used for both
-    training and validation.
+    A capture already in the set keeps its name. A new capture is named after its folder, with a
+    number if another capture has that name. Duplicate folders are used only once, because the same
+    pixels must not be used for both training and validation.
     """
     captures: dict[str, Path] = {}
     for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
@@ -55,13 +55,14 @@ def add_capture(
 ) -> None:
     """Read a capture and write its pixels with ground truth, unless the set has them.
 
-    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains on them at half
-    resolution. By default, saturated observations, from `white_level` if it is given, are restored and unknown light
-    intensities are estimated, as `infer` does; `as_stored` leaves the values unchanged. `update` replaces an entry
-    whose capture changed.
+    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains
+    on them at half resolution. By default, saturated observations, from `white_level` if it is
+    given, are restored and unknown light intensities are estimated, as `infer` does; `as_stored`
+    leaves the values unchanged. `update` replaces an entry whose capture changed.
 
-    Raises InputError if the capture cannot be read, or has no ground truth; CaptureChangedError if it changed since its
-    entry was created, and `update` is not set; OutputError if the entry cannot be written.
+    Raises InputError if the capture cannot be read, or has no ground truth; CaptureChangedError if
+    it changed since its entry was created, and `update` is not set; OutputError if the entry cannot
+    be written.
     """
     source = open_capture(folder, white_level=white_level)
     recipe: dict[str, Any] = {
@@ -93,7 +94,9 @@ def add_capture(
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
     # The PRPS images of CyclesPS are used at half resolution.
-    step = 2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
+    step = (
+        2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
+    )
     rows, columns = np.nonzero(capture.mask)
     used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
     if not used.any():
@@ -101,13 +104,19 @@ def add_capture(
     mask = np.zeros_like(capture.mask)
     mask[capture.mask] = used
     directions = capture.light_directions.astype(np.float32)
-    pixels = Pixels(capture.observations[used], normals[used].astype(np.float32), directions, mask[::step, ::step])
+    pixels = Pixels(
+        capture.observations[used],
+        normals[used].astype(np.float32),
+        directions,
+        mask[::step, ::step],
+    )
     # All materials of a CyclesPS object have the same shape.
     scene = source.files.folder.absolute().name if source.files.boundaries else name
     writer.add(name, scene, str(folder), recipe, pixels)
 
 
-RENDERER = 5  # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
+# Version of the renderer. Increase it when the result changes, because a set must not mix versions.
+RENDERER = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +132,8 @@ class ScenePlan:
 
     @cached_property
     def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
-        """The mesh, name and number of each mesh scene; the number does not depend on the count of views.
+        """The mesh, name and number of each mesh scene; the number does not depend on the count of
+        views.
 
         The name is the file name, with a number if another mesh has the same name.
         """
@@ -134,12 +144,19 @@ class ScenePlan:
         if not self.views:
             return tuple(named)
         views = range(self.views)
-        return tuple((path, f"{name}-view{n:03}", mesh + 10_000 * n) for n in views for path, name, mesh in named)
+        return tuple(
+            (path, f"{name}-view{n:03}", mesh + 10_000 * n)
+            for n in views
+            for path, name, mesh in named
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The names of the scenes."""
-        return (*(name for _, name, _ in self._of_mesh), *(f"scene{index:04}" for index in range(self.count)))
+        return (
+            *(name for _, name, _ in self._of_mesh),
+            *(f"scene{index:04}" for index in range(self.count)),
+        )
 
     def entry_names(self, position: int) -> dict[str, str]:
         """Return the names of a scene's entries by material."""
@@ -163,8 +180,8 @@ class ScenePlan:
     def check_inputs(self) -> None:
         """Check the inputs before rendering.
 
-        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the packages of the extra
-        `render` are not installed.
+        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the
+        packages of the extra `render` are not installed.
         """
         if self.names:
             for package in ("embreex.rtcore_scene", "skimage.measure"):
@@ -182,20 +199,26 @@ class ScenePlan:
                 difference = writer.difference(name, recipe) if name in writer else None
                 if difference is not None:
                     raise OutputError(
-                        f"the entry {name} was made with {difference}", path=writer.folder, hint="Choose another -o"
+                        f"the entry {name} was made with {difference}",
+                        path=writer.folder,
+                        hint="Choose another -o",
                     )
 
-    def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
+    def render(
+        self, position: int, progress: Callable[[float], None] | None = None
+    ) -> tuple[str, dict[str, Pixels]]:
         """Render a scene; return its shape in words, and the pixels by material.
 
-        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or
-        nothing is visible to the camera; UsageError if the packages of the extra `render` are not installed.
+        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot
+        be used, or nothing is visible to the camera; UsageError if the packages of the extra
+        `render` are not installed.
         """
         mesh_file = mesh = None
         index = position - len(self._of_mesh)
         if index < 0:
             mesh_file, _, number = self._of_mesh[position]
-            index = 1_000_000 + number  # of its own random stream, so that a mesh does not change any other scene
+            # of its own random stream, so that a mesh does not change any other scene
+            index = 1_000_000 + number
             mesh = read_mesh(mesh_file)
             if self.views:
                 others = tuple(path for path in self.meshes if path != mesh_file)
@@ -206,26 +229,40 @@ class ScenePlan:
             raise InputError(
                 "the camera sees nothing of the mesh",
                 path=mesh_file or self.names[position],
-                hint="The camera looks along -z. A face is visible if its corners are counter-clockwise"
+                hint="The camera looks along -z. A face is visible if its corners are"
+                " counter-clockwise"
                 " as seen from the camera",
             )
         normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
         # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
-        observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
-        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS}
+        observations = {
+            kind: values.astype(np.float16) for kind, values in rendered.observations.items()
+        }
+        return scene.shape, {
+            kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS
+        }
 
-    def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
+    def add(
+        self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]
+    ) -> None:
         """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
         recipe = self.recipe(position)
-        # All views of a mesh have one name, because all are used for training or all for validation.
-        scene = self._of_mesh[position][0].stem if position < len(self._of_mesh) else self.names[position]
+        # All views of a mesh have one name, because all are used for training or all for
+        # validation.
+        scene = (
+            self._of_mesh[position][0].stem
+            if position < len(self._of_mesh)
+            else self.names[position]
+        )
         for kind, name in self.entry_names(position).items():
             writer.add(name, scene, f"rendered: {shape}", recipe, pixels[kind])
 
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
     """Write the pixels of a scene to a file for load_rendered. Raises OutputError."""
-    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS}
+    arrays = {
+        f"{kind}.{name}": getattr(pixels[kind], name) for kind in MATERIALS for name in ARRAYS
+    }
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -233,4 +270,7 @@ def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
 def load_rendered(path: Path) -> dict[str, Pixels]:
     """Return the pixels in a file written by save_rendered. Raises OSError."""
     with np.load(path, allow_pickle=False) as arrays:
-        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in MATERIALS}
+        return {
+            kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS})
+            for kind in MATERIALS
+        }

@@ -1,12 +1,15 @@
-"""Pixel sets on disk: pixels with known normals under many lights, as memory-mapped arrays and a manifest.
+"""Pixel sets on disk: pixels with known normals under many lights, as memory-mapped arrays and a
+manifest.
 
-    SET/manifest.json                       format, version, entries with counts, recipes and checksums
-    SET/<entry>/observations.npy            (P, F), linear; float16 if rendered, float32 if read from a capture
-    SET/<entry>/normals.npy                 (P, 3) float32, unit
+    SET/manifest.json                       format, version, entries with counts, recipes and
+    checksums SET/<entry>/observations.npy            (P, F), linear; float16 if rendered, float32
+    if read from a capture SET/<entry>/normals.npy                 (P, 3) float32, unit
     SET/<entry>/light_directions.npy        (F, 3) float32, unit
-    SET/<entry>/mask.npy                    (H, W) bool with P true pixels; P runs in row-major order
+    SET/<entry>/mask.npy                    (H, W) bool with P true pixels; P runs in row-major
+    order
 
-Sets are written entry by entry, so that an interrupted command can continue. Training refuses an unfinished set.
+Sets are written entry by entry, so that an interrupted command can continue. Training refuses an
+unfinished set.
 """
 
 import hashlib
@@ -45,7 +48,8 @@ class Entry(Struct, frozen=True):
     """The description of an entry in the manifest."""
 
     name: str  # the folder of the entry, unique in its set
-    scene: str  # entries of one scene have the same shape, so they are all for training or all for validation
+    # entries of one scene have the same shape, so they are all for training or all for validation
+    scene: str
     source: str  # description of where the pixels come from, for the user
     recipe: dict[str, Any]  # plain values that determine the content of the entry
     n_pixels: Count  # P
@@ -82,9 +86,13 @@ class PixelSet:
         return [f"{entry.name}/{array}.npy" for entry in self.entries for array in ARRAYS]
 
     def load(self, entry: Entry) -> Pixels:
-        """Map the arrays of an entry into memory. Raises InputError if they do not match the manifest."""
+        """Map the arrays of an entry into memory. Raises InputError if they do not match the
+        manifest.
+        """
         # Convert to plain arrays, because slicing an np.memmap object takes ten times as long.
-        pixels = Pixels(*(np.asarray(_map(self.folder / entry.name / f"{array}.npy")) for array in ARRAYS))
+        pixels = Pixels(
+            *(np.asarray(_map(self.folder / entry.name / f"{array}.npy")) for array in ARRAYS)
+        )
         _check_arrays(entry, pixels, self.folder)
         return pixels
 
@@ -92,12 +100,15 @@ class PixelSet:
 def open_pixel_set(folder: Path) -> PixelSet:
     """Open a set after comparing every file with the checksums in its manifest.
 
-    Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error names the file.
+    Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error
+    names the file.
     """
     manifest = read_manifest(folder)
     if not manifest.complete:
         raise InputError(
-            "the pixel set is not finished", path=folder, hint="Run the same 'splinecli prepare' again to finish it"
+            "the pixel set is not finished",
+            path=folder,
+            hint="Run the same 'splinecli prepare' again to finish it",
         )
     pixel_set = PixelSet(folder, manifest.entries)
     if not pixel_set.entries:
@@ -109,7 +120,9 @@ def open_pixel_set(folder: Path) -> PixelSet:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read the manifest of a set, finished or not. Raises InputError, which names a field that is missing or wrong."""
+    """Read the manifest of a set, finished or not. Raises InputError, which names a field that is
+    missing or wrong.
+    """
     path = folder / MANIFEST
     try:
         values = read_json(path)
@@ -117,21 +130,36 @@ def read_manifest(folder: Path) -> Manifest:
         raise InputError(
             f"not a pixel set: its {MANIFEST} cannot be read ({error.strerror})",
             path=folder,
-            hint="Make one with 'splinecli prepare SOURCE -o SET' or 'splinecli prepare --scenes N -o SET'",
+            hint=(
+                "Make one with 'splinecli prepare SOURCE -o SET' or 'splinecli prepare --scenes N"
+                " -o SET'"
+            ),
         ) from error
     except ValueError as error:
         raise InputError(f"not JSON ({error})", path=path) from error
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT:
-        raise InputError(f"not the manifest of a pixel set: found format {found!r}, expected {FORMAT!r}", path=path)
+        raise InputError(
+            f"not the manifest of a pixel set: found format {found!r}, expected {FORMAT!r}",
+            path=path,
+        )
     try:
         manifest = convert(values, Manifest)
     except ValidationError as error:
         raise InputError(f"the manifest is damaged ({error})", path=path) from error
     for entry in manifest.entries:
-        if not set(ARRAYS) <= entry.sha256.keys():  # a file without a checksum would not be verified
-            raise InputError(f"the manifest is damaged (the entry {entry.name!r} lacks a checksum)", path=path)
-        if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
+        if (
+            not set(ARRAYS) <= entry.sha256.keys()
+        ):  # a file without a checksum would not be verified
+            raise InputError(
+                f"the manifest is damaged (the entry {entry.name!r} lacks a checksum)", path=path
+            )
+        if (
+            not entry.name
+            or entry.name == ".."
+            or "\0" in entry.name
+            or Path(entry.name).name != entry.name
+        ):
             raise InputError(f"{entry.name!r} is not the name of a folder", path=path)
     return manifest
 
@@ -157,7 +185,9 @@ def _check_arrays(entry: Entry, pixels: Pixels, folder: Path) -> None:
         found = getattr(pixels, array)
         if found.shape != shape or found.dtype.kind != "f":
             path = folder / entry.name / f"{array}.npy"
-            raise _mismatch(path, f"an array of shape {found.shape}, {found.dtype}", f"{shape}, float")
+            raise _mismatch(
+                path, f"an array of shape {found.shape}, {found.dtype}", f"{shape}, float"
+            )
     mask = pixels.mask
     if mask.ndim != 2 or mask.dtype != bool or np.count_nonzero(mask) != entry.n_pixels:
         path = folder / entry.name / "mask.npy"
@@ -180,25 +210,32 @@ def _mismatch(path: Path, found: str, expected: str) -> InputError:
     return InputError(
         f"does not match the manifest: found {found}, expected {expected}",
         path=path,
-        hint="Remove the folder of the set, or choose another -o, and run 'splinecli prepare' again",
+        hint=(
+            "Remove the folder of the set, or choose another -o, and run 'splinecli prepare' again"
+        ),
     )
 
 
 class PixelSetWriter:
     """Writes a new set, or adds entries to an existing one, finished or not.
 
-    The manifest never lists an entry whose files are being changed: the entry is removed before and added afterwards.
+    The manifest never lists an entry whose files are being changed: the entry is removed before and
+    added afterwards.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open the folder. Raises OutputError if it cannot be written or has other files; InputError if damaged."""
+        """Open the folder. Raises OutputError if it cannot be written or has other files;
+        InputError if damaged.
+        """
         check_writable(folder)
         self.folder = folder
         self._entries: dict[str, Entry] = {}
         if (folder / MANIFEST).exists():
             self._entries = {entry.name: entry for entry in read_manifest(folder).entries}
         elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
-            raise OutputError("has files in it but is not a pixel set", path=folder, hint="Choose another -o")
+            raise OutputError(
+                "has files in it but is not a pixel set", path=folder, hint="Choose another -o"
+            )
         else:
             self._write_manifest(complete=False)
 
@@ -218,7 +255,9 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Describe the first setting in which an entry's recipe differs, with both values; None if they are equal."""
+        """Describe the first setting in which an entry's recipe differs, with both values; None if
+        they are equal.
+        """
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
             if asked.get(key) != found.get(key):
@@ -230,7 +269,9 @@ class PixelSetWriter:
         entry = self._entries[name]
         return f"{name}: {entry.n_pixels} pixels, {entry.n_lights} lights, {entry.source}"
 
-    def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
+    def add(
+        self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels
+    ) -> None:
         """Write an entry of at least one pixel, replacing any earlier entry with the same name.
 
         Raises OutputError if it cannot be written. The other entries are not affected.
@@ -244,7 +285,9 @@ class PixelSetWriter:
                 checksums[array] = file_sha256(new.hidden[file])
             if self._entries.pop(name, None) is not None:
                 self._write_manifest(complete=False)
-        self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
+        self._entries[name] = Entry(
+            name, scene, source, _plain(recipe), n_pixels, n_lights, checksums
+        )
         self._write_manifest(complete=False)
 
     def finish(self) -> PixelSet:
@@ -254,7 +297,9 @@ class PixelSetWriter:
 
     def _write_manifest(self, *, complete: bool) -> None:
         entries = tuple(self._entries.values())
-        manifest = Manifest(FORMAT, __version__, complete, sum(entry.n_pixels for entry in entries), entries)
+        manifest = Manifest(
+            FORMAT, __version__, complete, sum(entry.n_pixels for entry in entries), entries
+        )
         write_text(self.folder / MANIFEST, json.dumps(to_builtins(manifest), indent=1) + "\n")
 
 

@@ -1,7 +1,9 @@
-"""Batches of training pixels, and the faults of a capture: exposure, noise, quantisation and errors of calibration.
+"""Batches of training pixels, and the faults of a capture: exposure, noise, quantisation and errors
+of calibration.
 
-Faults are random draws for each pixel from the distributions in the docstrings. They change only the sparse
-observations; the dense map stays the ground truth. Observations are linear, and 1 is the sensor's full scale.
+Faults are random draws for each pixel from the distributions in the docstrings. They change only
+the sparse observations; the dense map stays the ground truth. Observations are linear, and 1 is the
+sensor's full scale.
 """
 
 import math
@@ -19,33 +21,47 @@ from splinecli.records.base import Count, Share
 from splinecli.workshop.synthesis import draw_uniform
 
 
-def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
+def disturb_light_directions(
+    directions: Tensor, share: float, generator: torch.Generator
+) -> Tensor:
     """Add Gaussian calibration errors to the directions (P, F, 3) of a share of the pixels.
 
-    Their sigma along either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
+    Their sigma along either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth
+    exceeds 4.
     """
     pixels = len(directions)
     sigma = math.radians(8.0) * draw_uniform(generator, pixels, 1, 1) ** 3
     sigma = sigma * (draw_uniform(generator, pixels, 1, 1) < share)
-    moved = directions + sigma * torch.randn(directions.shape, generator=generator, device=directions.device)
+    moved = directions + sigma * torch.randn(
+        directions.shape, generator=generator, device=directions.device
+    )
     moved = torch.cat((moved[..., :2], moved[..., 2:].clamp(min=0.01)), dim=-1)
     return torch.nn.functional.normalize(moved, dim=-1)
 
 
-def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Multiply observations (P, F) by Gaussian intensity errors, sigma U(0, 5 %), for a share of the pixels."""
+def disturb_light_intensities(
+    observations: Tensor, share: float, generator: torch.Generator
+) -> Tensor:
+    """Multiply observations (P, F) by Gaussian intensity errors, sigma U(0, 5 %), for a share of
+    the pixels.
+    """
     sigma = draw_uniform(generator, len(observations), 1, high=0.05) * (
         draw_uniform(generator, len(observations), 1) < share
     )
-    factor = 1 + sigma * torch.randn(observations.shape, generator=generator, device=observations.device)
+    factor = 1 + sigma * torch.randn(
+        observations.shape, generator=generator, device=observations.device
+    )
     return observations * factor.clamp(min=0)
 
 
-def draw_light_intensities(pixels: int, lights: int, share: float, generator: torch.Generator) -> Tensor:
-    """Draw relative light intensities (P, F), the largest 1; for a share of the pixels 2^U(-2, 0), else equal ones.
+def draw_light_intensities(
+    pixels: int, lights: int, share: float, generator: torch.Generator
+) -> Tensor:
+    """Draw relative light intensities (P, F), the largest 1; for a share of the pixels 2^U(-2, 0),
+    else equal ones.
 
-    Images are taken with unequal lamps and divided by the intensities afterwards, so the observations under a weak lamp
-    have coarser steps and more noise.
+    Images are taken with unequal lamps and divided by the intensities afterwards, so the
+    observations under a weak lamp have coarser steps and more noise.
     """
     unequal = draw_uniform(generator, pixels, 1) < share
     intensities = 2 ** draw_uniform(generator, pixels, lights, low=-2.0, high=0.0)
@@ -53,10 +69,12 @@ def draw_light_intensities(pixels: int, lights: int, share: float, generator: to
 
 
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
-    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
+    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is
+    full scale.
 
-    The brightest observation of a pixel is 10^U(-2.7, -0.7) for 40 % of the pixels, which are dark compared with the
-    brightest in their capture, else 10^U(-1.3, 0). For `saturated_share` of the pixels it is U(1, 3), to be clipped.
+    The brightest observation of a pixel is 10^U(-2.7, -0.7) for 40 % of the pixels, which are dark
+    compared with the brightest in their capture, else 10^U(-1.3, 0). For `saturated_share` of the
+    pixels it is U(1, 3), to be clipped.
     """
     pixels = len(radiance)
     dark = draw_uniform(generator, pixels, 1) < 0.4
@@ -68,9 +86,11 @@ def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Gen
 
 
 def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
-    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both Gaussian.
+    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both
+    Gaussian.
 
-    The read noise is at most a thirtieth of a pixel's largest observation, because darker captures are rarely kept.
+    The read noise is at most a thirtieth of a pixel's largest observation, because darker captures
+    are rarely kept.
     """
     pixels = len(exposed)
     read = 10 ** draw_uniform(generator, pixels, 1, low=-4.0, high=-2.5)
@@ -84,8 +104,8 @@ def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
 def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
     """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to 10, 12, 14 or 16.
 
-    Half of the 8-bit pixels are encoded with the sRGB curve, rounded and decoded again. Of the others, half are rounded
-    and half truncated, as when only the high byte of 16 bits is kept.
+    Half of the 8-bit pixels are encoded with the sRGB curve, rounded and decoded again. Of the
+    others, half are rounded and half truncated, as when only the high byte of 16 bits is kept.
     """
     pixels = len(exposed)
     eight = draw_uniform(generator, pixels, 1) < eight_bit_share
@@ -98,11 +118,16 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     stored = np.linspace(0, 1, 511, dtype=np.float32)
     linear = torch.from_numpy(decode_transfer(stored, None)).to(exposed)
     encoded = linear[::2][torch.bucketize(exposed.contiguous(), linear[1::2].contiguous())]
-    return torch.where(eight & (kind < 0.5), encoded, torch.where(eight & (kind < 0.75), cut, rounded))
+    return torch.where(
+        eight & (kind < 0.5), encoded, torch.where(eight & (kind < 0.75), cut, rounded)
+    )
 
 
-def restore(observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
-    """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full scale.
+def restore(
+    observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full
+    scale.
 
     All arrays are (P, F), except the unit directions (P, F, 3). Invalid observations are ignored.
     """
@@ -122,25 +147,33 @@ LightCount = Annotated[int, Meta(ge=3)]
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How pixels are photographed, and how often each fault occurs, as a share of the pixels; 0 disables a fault."""
+    """How pixels are photographed, and how often each fault occurs, as a share of the pixels; 0
+    disables a fault.
+    """
 
     # min_lights, max_lights, usual_lights: see draw_light_counts
     min_lights: LightCount = 4
     max_lights: LightCount = 96
     usual_lights: LightCount = 10
-    # usual number of pixels per capture, which share lights, materials and faults. With 1, each pixel is independent.
+    # usual number of pixels per capture, which share lights, materials and faults. With 1, each
+    # pixel is independent.
     capture_pixels: Count = 1
     ambient_share: Share = 0.5  # captures under ambient light, and independently drawn pixels
     light_direction_error_share: Share = 0.5  # pixels with errors of the light directions
     light_intensity_error_share: Share = 0.5  # pixels with errors of the light intensities
-    unequal_lights_share: Share = 0.5  # pixels whose lights differ in intensity; the observations are normalised
-    saturated_share: Share = 0.1  # pixels with clipped observations; half are restored as in `infer`
+    # pixels whose lights differ in intensity; the observations are normalised
+    unequal_lights_share: Share = 0.5
+    # pixels with clipped observations; half are restored as in `infer`
+    saturated_share: Share = 0.1
     sensor_noise: bool = True  # whether to add noise and quantisation
     eight_bit_share: Share = 0.3  # pixels with 8 bits; the others have 10 to 16
-    optics_share: Share = 0.75  # captures photographed as images through a simulated lens and sensor; see draw_optics
+    # captures photographed as images through a simulated lens and sensor; see draw_optics
+    optics_share: Share = 0.75
 
     def captures(self, pixels: int) -> int:
-        """Return the number G of captures in a draw of `pixels` pixels. Pixel p belongs to capture p % G."""
+        """Return the number G of captures in a draw of `pixels` pixels. Pixel p belongs to capture
+        p % G.
+        """
         return max(1, pixels // self.capture_pixels)
 
 
@@ -149,7 +182,8 @@ class DenseMap(NamedTuple):
 
     values: Tensor  # (P, 1, w, w), zero where the value is unknown, such as outside the unit disc
     known: Tensor  # same shape, 1 where values are measured
-    filled: Tensor  # same shape, 1 where values are measured or interpolated from measured neighbours
+    # same shape, 1 where values are measured or interpolated from measured neighbours
+    filled: Tensor
 
 
 class PixelTruth(Protocol):
@@ -184,7 +218,9 @@ def photograph(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with its own camera and calibration faults."""
+    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with its own camera and
+    calibration faults.
+    """
     pixels, lights = radiance.shape
     intensities = draw_light_intensities(pixels, lights, config.unequal_lights_share, generator)
     radiance = radiance * valid

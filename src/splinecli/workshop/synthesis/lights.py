@@ -9,33 +9,42 @@ from torch import Tensor
 from splinecli.workshop.synthesis import draw_uniform
 
 
-def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:
+def draw_light_counts(
+    pixels: int, low: int, high: int, usual: int, generator: torch.Generator
+) -> Tensor:
     """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
 
-    Each draw has a maximum: for half of the draws it is usual - 1 to usual + 2, else it is log-uniform over low..high.
-    Every pixel has at least four fifths of that number, which keeps the padding small.
+    Each draw has a maximum: for half of the draws it is usual - 1 to usual + 2, else it is
+    log-uniform over low..high. Every pixel has at least four fifths of that number, which keeps the
+    padding small.
     """
     anywhere = low * ((high + 1) / low) ** draw_uniform(generator, 1)
     about = usual - 1 + 4 * draw_uniform(generator, 1)
-    largest = torch.where(draw_uniform(generator, 1) < 0.5, about, anywhere).floor().clamp(low, high)
+    largest = (
+        torch.where(draw_uniform(generator, 1) < 0.5, about, anywhere).floor().clamp(low, high)
+    )
     return (largest * (1 - 0.2 * draw_uniform(generator, pixels))).round().long().clamp(low, high)
 
 
 def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose `count` of the light directions (F, 3) at random, within a cone about the view axis; return their indices.
+    """Choose `count` of the light directions (F, 3) at random, within a cone about the view axis;
+    return their indices.
 
-    Its half-angle is U(20, 90) degrees, as in CNN-PS (Ikehata, ECCV 2018). If it contains too few lights, the closest
-    others are added.
+    Its half-angle is U(20, 90) degrees, as in CNN-PS (Ikehata, ECCV 2018). If it contains too few
+    lights, the closest others are added.
     """
     return rank_in_cone(directions[None], generator)[0].argsort()[:count]
 
 
 def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
-    """Return ranks (P, F) of the lights (P, F, 3) of P pixels; the lowest ranks are chosen, see choose_in_cone."""
+    """Return ranks (P, F) of the lights (P, F, 3) of P pixels; the lowest ranks are chosen, see
+    choose_in_cone.
+    """
     uniform = draw_uniform(generator, *directions.shape[:2])
     half_angle = _uniform_deg(generator, len(directions), 1, low=20, high=90)
     z = directions[..., 2]
-    # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
+    # Lights within the cone have a random rank below 1. The others follow, the closest to the axis
+    # first.
     return torch.where(z >= half_angle.cos(), uniform, 2 - z)
 
 
@@ -49,8 +58,8 @@ def draw_light_directions(
 ) -> Tensor:
     """Draw unit light directions (P, F, 3), a rig for each pixel.
 
-    A rig is a set of points in the (x, y) disc. It is rotated about the view axis at random, and points beyond a radius
-    of 0.996 are moved to the rim of the disc.
+    A rig is a set of points in the (x, y) disc. It is rotated about the view axis at random, and
+    points beyond a radius of 0.996 are moved to the rim of the disc.
     """
     kind = torch.multinomial(
         torch.tensor([shares.get(name, 0.0) for name in _RIGS], device=generator.device),
@@ -73,8 +82,9 @@ def draw_light_directions(
 def _draw_ellipse(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Fill an ellipse uniformly, by projected area.
 
-    One half-axis is sin U(20, 88) degrees, and the other is U(0.5, 1) times as long. Half of the rigs are off-centre by
-    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp above.
+    One half-axis is sin U(20, 88) degrees, and the other is U(0.5, 1) times as long. Half of the
+    rigs are off-centre by up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a
+    lamp above.
     """
     x, y = _in_disc(pixels, lights, generator)
     major = _uniform_deg(generator, pixels, 1, low=20, high=88).sin()
@@ -92,9 +102,11 @@ def _draw_cone(pixels: int, lights: int, generator: torch.Generator) -> Points:
 
 
 def _draw_ring(pixels: int, lights: int, generator: torch.Generator) -> Points:
-    """Place lights evenly at one angle of U(15, 75) degrees from the view axis, within 2 degrees (sigma).
+    """Place lights evenly at one angle of U(15, 75) degrees from the view axis, within 2 degrees
+    (sigma).
 
-    Half of the rings are complete, the others are arcs of U(120, 360) degrees. The azimuths have a sigma of 10 degrees.
+    Half of the rings are complete, the others are arcs of U(120, 360) degrees. The azimuths have a
+    sigma of 10 degrees.
     """
     arc = _uniform_deg(generator, pixels, 1, low=120, high=360)
     arc = torch.where(draw_uniform(generator, pixels, 1) < 0.5, 2 * math.pi, arc)
@@ -108,13 +120,19 @@ def _draw_line(pixels: int, lights: int, generator: torch.Generator) -> Points:
 
     They deviate from the line with a sigma of sin U(1, 10) degrees, so they are nearly coplanar.
     """
-    x = draw_uniform(generator, pixels, lights, low=-1) * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
+    x = (
+        draw_uniform(generator, pixels, lights, low=-1)
+        * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
+    )
     sigma = _uniform_deg(generator, pixels, 1, low=1, high=10).sin()
-    return x, draw_uniform(generator, pixels, 1, high=0.5) + sigma * _normal(generator, pixels, lights)
+    return x, draw_uniform(generator, pixels, 1, high=0.5) + sigma * _normal(
+        generator, pixels, lights
+    )
 
 
 def _draw_hand_held(pixels: int, lights: int, generator: torch.Generator) -> Points:
-    """Place lights in clusters, 20 to 70 degrees from the view axis, in a sector of U(90, 360) degrees.
+    """Place lights in clusters, 20 to 70 degrees from the view axis, in a sector of U(90, 360)
+    degrees.
 
     A cluster has U(1, 5) lights on average. They spread with a sigma of 6 degrees in either angle.
     """

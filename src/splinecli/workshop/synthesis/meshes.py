@@ -1,9 +1,11 @@
-"""Triangle meshes in the camera frame: x right, y up, z to the camera, whose view is the square [-1, 1]^2.
+"""Triangle meshes in the camera frame: x right, y up, z to the camera, whose view is the square
+[-1, 1]^2.
 
-They are read from files, or extracted from approximate signed distance fields. A field is a function of points (N, 3),
-negative inside the shape, that grows at about unit rate across the surface. Smooth union: Quilez, "Smooth minimum"
-(https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et al. 2003); the vertices are then moved onto
-the zero level set, and the gradient of the field gives their normals.
+They are read from files, or extracted from approximate signed distance fields. A field is a
+function of points (N, 3), negative inside the shape, that grows at about unit rate across the
+surface. Smooth union: Quilez, "Smooth minimum" (https://iquilezles.org/articles/smin). Surface:
+marching cubes (Lewiner et al. 2003); the vertices are then moved onto the zero level set, and the
+gradient of the field gives their normals.
 """
 
 import io
@@ -25,7 +27,9 @@ REACH = 0.94  # half-width of the object in the camera's square
 LONGEST_EDGE = 0.03  # of a face; longer ones are split
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
-"""Largest file size by format, in bytes. In the first three, one byte may give a triangle of 110 bytes in memory."""
+"""Largest file size by format, in bytes. In the first three, one byte may give a triangle of 110
+bytes in memory.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,16 +37,18 @@ class Mesh:
     """A triangle mesh."""
 
     vertices: Floats  # (V, 3) float32
-    faces: NDArray[np.int32]  # (T, 3) int32, indices of vertices, anticlockwise as seen from outside
+    # (T, 3) int32, indices of vertices, anticlockwise as seen from outside
+    faces: NDArray[np.int32]
     vertex_normals: Floats  # (V, 3) float32, unit, outward; shading interpolates them
 
 
 def read_mesh(path: str | Path) -> Mesh:
     """Read a mesh file (PLY, OBJ, STL or OFF) and fit it into the frame.
 
-    The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
-    angle. Long edges are split, so that every part of the surface has vertices and can have its own material. Raises
-    InputError if the file is missing, too large, not a mesh, or has no faces.
+    The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces
+    around it, weighted by angle. Long edges are split, so that every part of the surface has
+    vertices and can have its own material. Raises InputError if the file is missing, too large, not
+    a mesh, or has no faces.
     """
     import trimesh
 
@@ -58,8 +64,12 @@ def read_mesh(path: str | Path) -> Mesh:
         if count:
             with np.errstate(all="ignore"):
                 size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-            if not 0 < size < np.inf:  # also catches NaN; process() would remove triangles with such corners
-                raise InputError("the corners are not finite numbers, or all in one place", path=path)
+            if (
+                not 0 < size < np.inf
+            ):  # also catches NaN; process() would remove triangles with such corners
+                raise InputError(
+                    "the corners are not finite numbers, or all in one place", path=path
+                )
             loaded.vertices = loaded.vertices / size  # trimesh merges corners closer than 1e-8
         loaded.process()
         # Texture coordinates split vertices, and would split the smooth normals too.
@@ -74,7 +84,8 @@ def read_mesh(path: str | Path) -> Mesh:
         if is_out_of_memory(error):
             raise
         raise InputError(
-            f"not a mesh that can be read ({type(error).__name__}: {str(error).strip() or 'no reason given'})",
+            f"not a mesh that can be read ({type(error).__name__}:"
+            f" {str(error).strip() or 'no reason given'})",
             path=path,
             hint="Give a triangle mesh as PLY, OBJ, STL or OFF",
         ) from error
@@ -100,12 +111,16 @@ def _read_known(path: Path) -> tuple[str, bytes]:
     else:
         raise ValueError("it is in none of these formats")
     if len(content) > (most := _LONGEST[kind]):
-        raise InputError(f"found a longer file than {most / 1e6:.0f} MB", path=path, hint="Decimate the mesh")
+        raise InputError(
+            f"found a longer file than {most / 1e6:.0f} MB", path=path, hint="Decimate the mesh"
+        )
     return kind, content
 
 
 def fit_to_frame(mesh: Mesh) -> Mesh:
-    """Scale and centre a mesh: its larger extent in x and y becomes 2 * REACH, and its centre the origin."""
+    """Scale and centre a mesh: its larger extent in x and y becomes 2 * REACH, and its centre the
+    origin.
+    """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     scale = 2 * REACH / float((high - low)[:2].max())
     vertices = (mesh.vertices - (low + high) / 2) * np.float32(scale)
@@ -113,7 +128,9 @@ def fit_to_frame(mesh: Mesh) -> Mesh:
 
 
 def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = MOST_FACES) -> Mesh:
-    """Divide faces into four until no edge is longer than `longest` or there would be more than `most_faces` faces."""
+    """Divide faces into four until no edge is longer than `longest` or there would be more than
+    `most_faces` faces.
+    """
     # Interpolate positions and normals together, so that the shading stays the same.
     corners = np.concatenate((mesh.vertices, mesh.vertex_normals), axis=1).astype(np.float64)
     faces = mesh.faces.astype(np.int64)
@@ -139,7 +156,9 @@ Field = Callable[[Floats], Floats]
 
 
 def ellipsoid(half_axes: Floats) -> Field:
-    """Return an ellipsoid around the origin. The distance is exact on the surface, and everywhere for a sphere."""
+    """Return an ellipsoid around the origin. The distance is exact on the surface, and everywhere
+    for a sphere.
+    """
 
     def distance(points: Floats) -> Floats:
         scaled = np.linalg.norm(points / half_axes, axis=1)
@@ -174,7 +193,9 @@ def capsule(half_length: float, radius: float) -> Field:
     """Return a rod along z with round ends."""
 
     def distance(points: Floats) -> Floats:
-        along = points[:, 2] - np.clip(points[:, 2], -np.float32(half_length), np.float32(half_length))
+        along = points[:, 2] - np.clip(
+            points[:, 2], -np.float32(half_length), np.float32(half_length)
+        )
         return np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + along**2) - np.float32(radius)
 
     return distance
@@ -186,7 +207,9 @@ def moved(field: Field, rotation: Floats, centre: Floats) -> Field:
 
 
 def smooth_union(first: Floats, second: Floats, blend: float) -> Floats:
-    """Return the distance to the union of two shapes, with a fillet of width `blend` along the seam."""
+    """Return the distance to the union of two shapes, with a fillet of width `blend` along the
+    seam.
+    """
     overlap = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - overlap * overlap * np.float32(blend / 4)
 
@@ -197,13 +220,17 @@ def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
 
 
 def waves(rng: np.random.Generator, frequency: float, outputs: int = 1) -> Field:
-    """Draw a smooth random function (N, outputs) of about unit variance: plane waves of random directions.
+    """Draw a smooth random function (N, outputs) of about unit variance: plane waves of random
+    directions.
 
-    The wave numbers are U(0.6, 1.4) * frequency, in cycles per unit length. A single output has shape (N,).
+    The wave numbers are U(0.6, 1.4) * frequency, in cycles per unit length. A single output has
+    shape (N,).
     """
     count = 10
     directions = rng.normal(size=(3, count))
-    directions *= 2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
+    directions *= (
+        2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
+    )
     phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
     mixing = rng.normal(size=(count, outputs)) * np.sqrt(2 / count)
     matrix, mixing = directions.astype(np.float32), mixing.astype(np.float32)
@@ -216,7 +243,9 @@ def waves(rng: np.random.Generator, frequency: float, outputs: int = 1) -> Field
 
 
 def ridges(rng: np.random.Generator, frequency: float) -> Field:
-    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| in two octaves, one half as high."""
+    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| in two octaves,
+    one half as high.
+    """
     low, high = waves(rng, frequency), waves(rng, 2 * frequency)
 
     def value(points: Floats) -> Floats:
@@ -229,11 +258,16 @@ def ridges(rng: np.random.Generator, frequency: float) -> Field:
 def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
     """Return the gradient (N, 3) by central differences."""
     axes = np.eye(3, dtype=np.float32) * np.float32(step)
-    return np.stack([(field(points + a) - field(points - a)) / np.float32(2 * step) for a in axes], axis=1)
+    return np.stack(
+        [(field(points + a) - field(points - a)) / np.float32(2 * step) for a in axes], axis=1
+    )
 
 
-def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: float) -> Mesh | None:
-    """Return the surface of a field inside a box around the origin, sampled every `spacing`; None if it is empty.
+def triangulate(
+    field: Field, half_widths: tuple[float, float, float], spacing: float
+) -> Mesh | None:
+    """Return the surface of a field inside a box around the origin, sampled every `spacing`; None
+    if it is empty.
 
     Only the largest connected part is kept.
     """
@@ -245,12 +279,18 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     if not values.min() < 0 < values.max():
         return None
     measure = import_extra("skimage.measure", "render")
-    # The corners of a face run anticlockwise as seen from the side with values above 0, which is outside.
+    # The corners of a face run anticlockwise as seen from the side with values above 0, which is
+    # outside.
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
-    part = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices))
+    part = connected_component_labels(
+        faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices)
+    )
     kept = part == np.bincount(part).argmax()
-    vertices, faces = vertices[kept], (np.cumsum(kept) - 1)[faces[kept[faces[:, 0]]]].astype(np.int32)
+    vertices, faces = (
+        vertices[kept],
+        (np.cumsum(kept) - 1)[faces[kept[faces[:, 0]]]].astype(np.int32),
+    )
     # Take one Newton step, because linear interpolation between samples leaves terraces.
     slope = gradient(field, vertices)
     squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
@@ -260,13 +300,18 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
-COARSE = 4  # Samples along the edge of a coarse cell. Cells far from the surface are not sampled at full resolution.
+# Samples along the edge of a coarse cell. Cells far from the surface are not sampled at full
+# resolution.
+COARSE = 4
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
-    """Sample the field on the grid of three axes: exactly near its surface, with the right sign elsewhere."""
+    """Sample the field on the grid of three axes: exactly near its surface, with the right sign
+    elsewhere.
+    """
     coarse = _evaluate(field, *np.meshgrid(*(axis[::COARSE] for axis in axes), indexing="ij"))
-    # Fields grow at rates up to about 2. The centre of a cell is half its diagonal away from its corners.
+    # Fields grow at rates up to about 2. The centre of a cell is half its diagonal away from its
+    # corners.
     reach = 2 * COARSE * spacing * np.sqrt(3) / 2
     near = np.abs(coarse) < reach
     close = np.zeros([size - 1 for size in coarse.shape], dtype=bool)
@@ -289,5 +334,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
 def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
     # Evaluate in pieces that fit into the processor's cache.
-    pieces = [field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)]
+    pieces = [
+        field(points[start : start + 32_768]) for start in range(0, max(len(points), 1), 32_768)
+    ]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)

@@ -1,8 +1,10 @@
-"""The online pixel generator, which makes batches of training pixels on the device of its random generator.
+"""The online pixel generator, which makes batches of training pixels on the device of its random
+generator.
 
-Each pixel has its own normal and walls, and either its own material or that shared by its capture. Its radiance can be
-computed under any light: a random rig gives the sparse observations, and the directions of all cells give the complete
-dense map. PX-Net (Logothetis et al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
+Each pixel has its own normal and walls, and either its own material or that shared by its capture.
+Its radiance can be computed under any light: a random rig gives the sparse observations, and the
+directions of all cells give the complete dense map. PX-Net (Logothetis et al., ICCV 2021) trains a
+per-pixel network in this way, without rendered objects.
 """
 
 from __future__ import annotations
@@ -39,30 +41,43 @@ class Wall:
     facing: Tensor  # (P, 3), the wall's normal
     reflectance: Tensor  # (P, 1), share of the light on the wall that reaches the pixel
     towards: Tensor  # (P, 3), unit vector to the part of the wall that reflects
-    has_pixel_material: Tensor  # (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte
+    # (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte
+    has_pixel_material: Tensor
 
     def visibility(self, directions: Tensor) -> Tensor:
-        """Return the share of each light that passes the wall (P, D): a cast shadow over one sector of the map.
+        """Return the share of each light that passes the wall (P, D): a cast shadow over one sector
+        of the map.
 
-        A direction is blocked if its elevation is below the top of the wall, l_z < tan(height) l_along, and it is
-        within the width of the wall, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
+        A direction is blocked if its elevation is below the top of the wall, l_z < tan(height)
+        l_along, and it is within the width of the wall, |l_across| < tan(half width) l_along; the
+        edge is `softness` wide in l_z.
         """
         along = dot(self.azimuth, directions)
-        quarter_turn = torch.stack((-self.azimuth[:, 1], self.azimuth[:, 0], self.azimuth[:, 2]), dim=-1)
+        quarter_turn = torch.stack(
+            (-self.azimuth[:, 1], self.azimuth[:, 0], self.azimuth[:, 2]), dim=-1
+        )
         across = dot(quarter_turn, directions).abs()
-        depth = torch.minimum(self.tan_height * along - directions[..., 2], self.tan_half_width * along - across)
+        depth = torch.minimum(
+            self.tan_height * along - directions[..., 2], self.tan_half_width * along - across
+        )
         return 1 - (depth / self.softness).clamp(0, 1)
 
-    def reflected(self, normals: Tensor, material: PrincipledMaterial, directions: Tensor) -> Tensor:
-        """Return the radiance (P, D) that light from the wall adds to pixels with these normals (P, 3) and material.
+    def reflected(
+        self, normals: Tensor, material: PrincipledMaterial, directions: Tensor
+    ) -> Tensor:
+        """Return the radiance (P, D) that light from the wall adds to pixels with these normals (P,
+        3) and material.
 
-        The reflected light comes from one direction, `towards`, and causes a highlight on metal. Real walls and
-        reflections are extended, so both are limited to three times the reflection of a matte white surface.
+        The reflected light comes from one direction, `towards`, and causes a highlight on metal.
+        Real walls and reflections are extended, so both are limited to three times the reflection
+        of a matte white surface.
         """
         returned = directions.new_zeros(len(normals), directions.shape[-2])
         facing_cosine = -dot(self.facing, self.towards[:, None])
         for same in (False, True):
-            pixels = ((self.reflectance[:, 0] > 0) & (self.has_pixel_material[:, 0] == same)).nonzero()[:, 0]
+            pixels = (
+                (self.reflectance[:, 0] > 0) & (self.has_pixel_material[:, 0] == same)
+            ).nonzero()[:, 0]
             if not len(pixels):
                 continue
             lights = directions if directions.ndim == 2 else directions[pixels]
@@ -75,13 +90,18 @@ class Wall:
                 leaving = incident.clamp(min=0)
             seen = normals[pixels]
             response = own.shade(dot(seen, towards[:, None]), seen[:, 2:], towards[:, 2:])
-            returned[pixels] = leaving.clamp(max=3) * (response.clamp(max=3) * self.reflectance[pixels])
+            returned[pixels] = leaving.clamp(max=3) * (
+                response.clamp(max=3) * self.reflectance[pixels]
+            )
         return returned
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Wall:
         """Rotate the wall about the view axis."""
         vectors = {"azimuth": self.azimuth, "facing": self.facing, "towards": self.towards}
-        return replace(self, **{name: rotate_about_view_axis(each, cosine, sine) for name, each in vectors.items()})
+        return replace(
+            self,
+            **{name: rotate_about_view_axis(each, cosine, sine) for name, each in vectors.items()},
+        )
 
 
 def draw_wall(
@@ -92,14 +112,15 @@ def draw_wall(
     shadows: bool = True,
     interreflections: bool = True,
 ) -> Wall:
-    """Draw walls for a share of the pixels with these normals (P, 3); a tensor (P, 1) gives a share per pixel.
+    """Draw walls for a share of the pixels with these normals (P, 3); a tensor (P, 1) gives a share
+    per pixel.
 
-    azimuth: N(0, 50 degrees) from the normal's for 60 %, because a surface in a hollow faces a wall; else uniform.
-    height: U(8, 75) degrees. half-width: tan U(15, 88) degrees. softness: U(0.01, 0.06).
-    facing: the wall leans back by U(0, 60) degrees from upright.
+    azimuth: N(0, 50 degrees) from the normal's for 60 %, because a surface in a hollow faces a
+    wall; else uniform. height: U(8, 75) degrees. half-width: tan U(15, 88) degrees. softness:
+    U(0.01, 0.06). facing: the wall leans back by U(0, 60) degrees from upright.
     towards: at U(0.2, 0.9) of the height, on the side that faces the pixel.
-    reflectance: (1 - cos(height)) U(0, 1) U(0.5, 2). Half of the walls have the pixel's material. The others are
-    matte, with an albedo of U(0.05, 0.9).
+    reflectance: (1 - cos(height)) U(0, 1) U(0.5, 2). Half of the walls have the pixel's material.
+    The others are matte, with an albedo of U(0.05, 0.9).
     """
     pixels = len(normals)
     uniform = partial(draw_uniform, generator, pixels, 1)
@@ -131,14 +152,18 @@ def draw_wall(
 
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
-    """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the pixels, else 0."""
+    """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the
+    pixels, else 0.
+    """
     present = draw_uniform(generator, pixels, 1) < share
     return 10 ** draw_uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
 
 
 @dataclass(frozen=True)
 class PixelGeneratorConfig(CaptureConfig):
-    """Switches and shares of the pixel generator and its captures. A share of 0 disables an effect."""
+    """Switches and shares of the pixel generator and its captures.
+    A share of 0 disables an effect.
+    """
 
     cast_shadows: bool = True
     interreflections: bool = True
@@ -149,7 +174,9 @@ class PixelGeneratorConfig(CaptureConfig):
 
 @dataclass(frozen=True)
 class PixelScene:
-    """P pixels viewed from +z. `mixed` is a second surface in the first M pixels: an edge, or a second material."""
+    """P pixels viewed from +z. `mixed` is a second surface in the first M pixels: an edge, or a
+    second material.
+    """
 
     normals: Tensor
     material: PrincipledMaterial
@@ -159,7 +186,9 @@ class PixelScene:
     mixed_weight: Tensor | None = None
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white facing the light gives 1."""
+        """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white facing the
+        light gives 1.
+        """
         visible = torch.ones((), device=self.normals.device)
         returned = self.material.albedo() * self.ambient
         for wall in self.walls:
@@ -182,7 +211,12 @@ class PixelScene:
         if mixed is not None:
             mixed = mixed.rotate(cosine[: len(mixed.normals)], sine[: len(mixed.normals)])
         walls = tuple(wall.rotate(cosine, sine) for wall in self.walls)
-        return replace(self, normals=rotate_about_view_axis(self.normals, cosine, sine), walls=walls, mixed=mixed)
+        return replace(
+            self,
+            normals=rotate_about_view_axis(self.normals, cosine, sine),
+            walls=walls,
+            mixed=mixed,
+        )
 
     def dense_truth(self, size: int = MAP_SIZE) -> DenseMap:
         """Return the complete maps: radiance at the cell centres, known in the whole disc."""
@@ -194,18 +228,23 @@ class PixelScene:
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
-    """Draw unit normals (P, 3) towards the camera, uniform by projected area as on the pixels of a sphere."""
+    """Draw unit normals (P, 3) towards the camera, uniform by projected area as on the pixels of a
+    sphere.
+    """
     radius = 0.997 * torch.sqrt(torch.rand(pixels, generator=generator, device=generator.device))
     azimuth = 2 * torch.pi * torch.rand(pixels, generator=generator, device=generator.device)
-    return torch.stack((radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1)
+    return torch.stack(
+        (radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1
+    )
 
 
 def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
-    """Draw random pixels. Half of the mixed pixels are on an edge, with a second normal; half blend two materials.
+    """Draw random pixels. Half of the mixed pixels are on an edge, with a second normal; half blend
+    two materials.
 
     Pixel p belongs to capture p % G (CaptureConfig). All pixels of a capture share their materials
-    (draw_shared_materials) and the probability of a wall: the usual share times U(-0.7, 2.3), or zero if that is
-    negative, as on convex objects.
+    (draw_shared_materials) and the probability of a wall: the usual share times U(-0.7, 2.3), or
+    zero if that is negative, as on convex objects.
     """
     normals = draw_visible_normals(pixels, generator)
     if config.capture_pixels == 1:
@@ -213,14 +252,19 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         hollow: float | Tensor = 1.0
         ambient_share = config.ambient_share
     else:
-        ambient_share = 0.0  # photograph_scene adds the ambient light that all pixels of a capture share
+        # photograph_scene adds the ambient light that all pixels of a capture share
+        ambient_share = 0.0
         captures = config.captures(pixels)
         material = draw_shared_materials(pixels, captures, generator)
         hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)
         hollow = hollow.repeat(pixels // captures, 1)
     walls = tuple(
         draw_wall(
-            normals, hollow * share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
+            normals,
+            hollow * share,
+            generator,
+            shadows=config.cast_shadows,
+            interreflections=config.interreflections,
         )
         for share in (config.wall_share, config.second_wall_share)
         if share > 0 and (config.cast_shadows or config.interreflections)
@@ -229,23 +273,31 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     count = round(config.mixed_share * pixels)
     if not count:
         return PixelScene(normals, material, walls, ambient)
-    # Every second mixed pixel is an edge, with one material on two normals. The others have two materials.
+    # Every second mixed pixel is an edge, with one material on two normals. The others have two
+    # materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     second = choose(edge, material.take(slice(count)), draw_material(count, generator))
-    # Across an edge, a Gaussian of sigma 0.5 is added to the normal, which stays towards the camera.
-    moved = normals[:count] + 0.5 * torch.randn((count, 3), generator=generator, device=normals.device)
+    # Across an edge, a Gaussian of sigma 0.5 is added to the normal, which stays towards the
+    # camera.
+    moved = normals[:count] + 0.5 * torch.randn(
+        (count, 3), generator=generator, device=normals.device
+    )
     moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
     second_normals = torch.where(edge, torch.nn.functional.normalize(moved, dim=1), normals[:count])
     mixed = PixelScene(second_normals, second, (), ambient[:count])
-    weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
+    weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(
+        edge, 0.4, 0.7
+    )
     return PixelScene(normals, material, walls, ambient, mixed, weight)
 
 
-def draw_shared_materials(pixels: int, captures: int, generator: torch.Generator) -> PrincipledMaterial:
+def draw_shared_materials(
+    pixels: int, captures: int, generator: torch.Generator
+) -> PrincipledMaterial:
     """Draw the materials of some pixels; pixel p belongs to capture p % captures.
 
-    60 % of the captures have one material, the others 2 to 8. In half of the captures, the materials differ only in
-    their base colour, as on a painted or printed object of uniform gloss.
+    60 % of the captures have one material, the others 2 to 8. In half of the captures, the
+    materials differ only in their base colour, as on a painted or printed object of uniform gloss.
     """
     drawn = draw_material(captures * 8, generator)
     count = 2 + (7 * draw_uniform(generator, captures)).long()
@@ -271,7 +323,15 @@ class PixelGenerator:
         captures = config.captures(pixels)
         size = pixels // captures
         scene = draw_scene(pixels, config, generator)
-        counts = draw_light_counts(captures, config.min_lights, config.max_lights, config.usual_lights, generator)
-        directions = draw_light_directions(captures, int(counts.max()), generator).repeat(size, 1, 1)
-        valid = torch.arange(directions.shape[1], device=counts.device) < counts.repeat(size)[:, None]
-        return photograph_captures(scene, scene.radiance(directions), directions, valid, config, generator)
+        counts = draw_light_counts(
+            captures, config.min_lights, config.max_lights, config.usual_lights, generator
+        )
+        directions = draw_light_directions(captures, int(counts.max()), generator).repeat(
+            size, 1, 1
+        )
+        valid = (
+            torch.arange(directions.shape[1], device=counts.device) < counts.repeat(size)[:, None]
+        )
+        return photograph_captures(
+            scene, scene.radiance(directions), directions, valid, config, generator
+        )

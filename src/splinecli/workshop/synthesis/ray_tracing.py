@@ -1,8 +1,9 @@
-"""Ray-mesh intersection by Embree (https://www.embree.org) through embreex, and the surface visible to a camera.
+"""Ray-mesh intersection by Embree (https://www.embree.org) through embreex, and the surface visible
+to a camera.
 
-embreex is part of the extra `render` and is imported when a Tracer is made. The orthographic camera looks along -z at
-the square [-1, 1]^2. A pixel is the mean of k x k samples on a regular grid. One sample at the centre is not enough:
-on glossy metal its radiance is off by a tenth.
+embreex is part of the extra `render` and is imported when a Tracer is made. The orthographic camera
+looks along -z at the square [-1, 1]^2. A pixel is the mean of k x k samples on a regular grid. One
+sample at the centre is not enough: on glossy metal its radiance is off by a tenth.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from splinecli.maths.normals import unit
 from splinecli.system.machine import import_extra
 from splinecli.workshop.synthesis.meshes import Floats, Mesh
 
-# Distance from the surface at which rays start. The frame has half-width 1, so float32 rounding displaces hits by about
-# 1e-7; at 128 pixels, one pixel is 0.016 wide.
+# Distance from the surface at which rays start. The frame has half-width 1, so float32 rounding
+# displaces hits by about 1e-7; at 128 pixels, one pixel is 0.016 wide.
 OFFSET = 1e-4
 TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
@@ -54,21 +55,31 @@ class Tracer:
         self._scene = import_extra("embreex.rtcore_scene", "render").EmbreeScene()
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
         import_extra("embreex.mesh_construction", "render").TriangleMesh(self._scene, corners)
-        self._facet_normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        self._facet_normals = unit(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        )
 
     def first_hits(self, origins: Floats, directions: Floats) -> tuple[NDArray[np.int64], Hits]:
-        """Return the rows (K,) of the rays that hit the surface, and the K points that they hit first."""
+        """Return the rows (K,) of the rays that hit the surface, and the K points that they hit
+        first.
+        """
         found = self._scene.run(_packed(origins), _packed(directions), output=True)
         rays = (found["primID"] >= 0).nonzero()[0]
         u, v = found["u"][rays], found["v"][rays]
-        triangle, weights = found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1)
+        triangle, weights = (
+            found["primID"][rays].astype(np.int64),
+            np.stack((1 - u - v, u, v), axis=1),
+        )
         corners = self.mesh.faces[triangle]
         position = np.einsum("nk,nkc->nc", weights, self.mesh.vertices[corners])
         normal = unit(np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners]))
         return rays, Hits(triangle, weights, position, normal, self._facet_normals[triangle])
 
-    def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
-        """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`.
+    def lit(
+        self, origins: Floats, facing: NDArray[np.bool_], directions: Floats
+    ) -> NDArray[np.bool_]:
+        """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if
+        not `facing`.
 
         With a single light (F = 1), the directions may also differ between origins: (N, 3).
         """
@@ -98,7 +109,9 @@ class ShadowCache:
         self._known = np.zeros(vertices, dtype=bool)
 
     def lit(self, hits: Hits) -> NDArray[np.bool_]:
-        """Return which lights reach the vertices nearest to the surface points, (N, F). Many at a time are faster."""
+        """Return which lights reach the vertices nearest to the surface points, (N, F). Many at a
+        time are faster.
+        """
         mesh = self._tracer.mesh
         nearest = np.asarray(mesh.faces[hits.triangle, hits.weights.argmax(axis=1)], dtype=np.int64)
         new = np.unique(nearest[~self._known[nearest]])
@@ -136,11 +149,13 @@ def find_visible_surface(
 ) -> VisibleSurface:
     """Trace the camera's rays: size x size pixels of samples x samples samples each.
 
-    A pixel is dropped if more than half of its samples miss the surface, or if the surface is at a grazing angle.
-    Samples that miss are replaced by other samples of the same pixel. `bend` gives new normals (N, 3) from the mesh
-    normals and the positions of the samples.
+    A pixel is dropped if more than half of its samples miss the surface, or if the surface is at a
+    grazing angle. Samples that miss are replaced by other samples of the same pixel. `bend` gives
+    new normals (N, 3) from the mesh normals and the positions of the samples.
     """
-    steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(2 / (size * samples)) - 1
+    steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(
+        2 / (size * samples)
+    ) - 1
     row, column = np.meshgrid(np.arange(size * samples), np.arange(size * samples), indexing="ij")
 
     def by_pixel(grid: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -148,7 +163,9 @@ def find_visible_surface(
 
     x, y = steps[by_pixel(column)], -steps[by_pixel(row)]
     top = np.full_like(x, tracer.mesh.vertices[:, 2].max() + 1)
-    rays, hits = tracer.first_hits(np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32))
+    rays, hits = tracer.first_hits(
+        np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32)
+    )
     front = hits.normal[:, 2] > 0
     rays, hits = rays[front], hits.take(front)
     if bend is not None:
@@ -163,4 +180,6 @@ def find_visible_surface(
     coverage = (found[seen] / per_pixel).astype(np.float32)
     seen[seen] = kept
     mask = seen.reshape(size, size)
-    return VisibleSurface(mask, normals[kept], hits.take(rows[kept].ravel()), per_pixel, coverage[kept])
+    return VisibleSurface(
+        mask, normals[kept], hits.take(rows[kept].ravel()), per_pixel, coverage[kept]
+    )

@@ -1,17 +1,19 @@
 """Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018), and their light transport.
 
-A scene has one shape, three sets of materials in each of three classes, and directional lights over the whole upper
-hemisphere. Additional materials take little time, because the light paths are the same. A scene depends only on (seed,
-index), so an interrupted set can be continued.
+A scene has one shape, three sets of materials in each of three classes, and directional lights over
+the whole upper hemisphere. Additional materials take little time, because the light paths are the
+same. A scene depends only on (seed, index), so an interrupted set can be continued.
 
-The camera is orthographic. A matte white surface facing the light has radiance 1. Each sample of a pixel is shaded with
-its own interpolated normal. Indirect light is gathered along random paths that start at the samples (Kajiya, "The
-rendering equation", 1986). All lights illuminate each vertex of a path at once. Visibility does not depend on the
-material, so paths and shadows are traced once for all materials.
+The camera is orthographic. A matte white surface facing the light has radiance 1. Each sample of a
+pixel is shaded with its own interpolated normal. Indirect light is gathered along random paths that
+start at the samples (Kajiya, "The rendering equation", 1986). All lights illuminate each vertex of
+a path at once. Visibility does not depend on the material, so paths and shadows are traced once for
+all materials.
 
-Two approximations reduce noise, because caustics would otherwise appear as single bright pixels. First, surfaces
-that emit or receive indirect light have at least roughness 0.3 (path space regularization, Kaplanyan & Dachsbacher
-2013). Second, surface points beyond the first use the shadows of the nearest vertex.
+Two approximations reduce noise, because caustics would otherwise appear as single bright pixels.
+First, surfaces that emit or receive indirect light have at least roughness 0.3 (path space
+regularization, Kaplanyan & Dachsbacher 2013). Second, surface points beyond the first use the
+shadows of the nearest vertex.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ from splinecli.workshop.synthesis.ray_tracing import (
 )
 from splinecli.workshop.synthesis.shapes import Relief, draw_detail, draw_shape, read_relief
 
-SHADED_ROWS = 512  # points shaded together: a tensor then takes about a megabyte and stays in the cache
+# points shaded together: a tensor then takes about a megabyte and stays in the cache
+SHADED_ROWS = 512
 
 Materials = Mapping[str, PrincipledMaterial]
 Progress = Callable[[float], None]
@@ -54,7 +57,9 @@ def render_direct(
     patch_of_face: NDArray[np.int64],
     progress: Progress = lambda _: None,
 ) -> dict[str, Tensor]:
-    """Return radiances (P, F) of each material under lights (F, 3): direct light only, with cast shadows."""
+    """Return radiances (P, F) of each material under lights (F, 3): direct light only, with cast
+    shadows.
+    """
     pixels, directions = len(visible.normals), torch.from_numpy(lights)
     radiance = {name: torch.empty(pixels, len(lights)) for name in materials}
     block = max(1, SHADED_ROWS // visible.samples_per_pixel)
@@ -67,10 +72,14 @@ def render_direct(
         cosines *= torch.from_numpy(lit)
         patches = torch.from_numpy(patch_of_face[hits.triangle])
         for first in range(0, len(rows), block):
-            some = slice(first * visible.samples_per_pixel, (first + block) * visible.samples_per_pixel)
+            some = slice(
+                first * visible.samples_per_pixel, (first + block) * visible.samples_per_pixel
+            )
             target = slice(start + first, min(start + first + block, pixels))
             for name, material in materials.items():
-                shaded = material.take(patches[some]).shade(cosines[some], normals[some, 2:], directions[:, 2])
+                shaded = material.take(patches[some]).shade(
+                    cosines[some], normals[some, 2:], directions[:, 2]
+                )
                 shape = (-1, visible.samples_per_pixel, len(lights))
                 torch.mean(shaded.view(shape), dim=1, out=radiance[name][target])
         progress((rows[-1] + 1) / pixels)
@@ -78,7 +87,9 @@ def render_direct(
 
 
 def before_black(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
-    """Return the radiance in front of a black background, weighted by the coverage of each pixel."""
+    """Return the radiance in front of a black background, weighted by the coverage of each
+    pixel.
+    """
     coverage = torch.from_numpy(visible.coverage)[:, None]
     return {name: values.mul_(coverage) for name, values in radiance.items()}
 
@@ -92,7 +103,9 @@ class _Vertices:
 
     def take(self, rows: Tensor) -> _Vertices:
         kept = rows.numpy()
-        return _Vertices(self.hits.take(kept), self.back[rows], self.pixel[rows], self.patches[rows])
+        return _Vertices(
+            self.hits.take(kept), self.back[rows], self.pixel[rows], self.patches[rows]
+        )
 
 
 def render_indirect(
@@ -107,9 +120,11 @@ def render_indirect(
     generator: torch.Generator,
     progress: Progress = lambda _: None,
 ) -> dict[str, Tensor]:
-    """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times before.
+    """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times
+    before.
 
-    `patch_of_face` (T,) gives the row of each face in the materials, `directions` the number of paths per pixel.
+    `patch_of_face` (T,) gives the row of each face in the materials, `directions` the number of
+    paths per pixel.
     """
     pixels = len(visible.normals)
     soft = {name: soften(material) for name, material in materials.items()}
@@ -133,13 +148,20 @@ def render_indirect(
             if bounce:
                 ordinal = torch.randint(0, 1 << 16, (len(vertices.pixel),), generator=generator)
                 shift = torch.rand(len(vertices.pixel), 2, generator=generator)
-            vertices, weights = _extend(tracer, vertices, weights, soft, patch_of_face, ordinal, shift)
+            vertices, weights = _extend(
+                tracer, vertices, weights, soft, patch_of_face, ordinal, shift
+            )
             _gather(vertices, weights, soft, torch.from_numpy(lights), shadows, radiance)
-            # Russian roulette: a path survives with its remaining weight in the brightest material as probability.
-            chance = (torch.stack(list(weights.values())).amax(dim=0)[:, 0] / (1 / directions)).clamp(0.0, 1.0)
+            # Russian roulette: a path survives with its remaining weight in the brightest material
+            # as probability.
+            chance = (
+                torch.stack(list(weights.values())).amax(dim=0)[:, 0] / (1 / directions)
+            ).clamp(0.0, 1.0)
             alive = (torch.rand(len(chance), generator=generator) < chance).nonzero()[:, 0]
             vertices = vertices.take(alive)
-            weights = {name: weight[alive] / chance[alive, None] for name, weight in weights.items()}
+            weights = {
+                name: weight[alive] / chance[alive, None] for name, weight in weights.items()
+            }
             if not len(alive):
                 break
         progress((int(rows[-1]) + 1) / pixels)
@@ -147,7 +169,9 @@ def render_indirect(
 
 
 def soften(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Return the reflectance without its sharpest lobes, for surfaces that illuminate other surfaces."""
+    """Return the reflectance without its sharpest lobes, for surfaces that illuminate other
+    surfaces.
+    """
     return replace(
         material,
         roughness=material.roughness.clamp(min=0.3),
@@ -165,7 +189,9 @@ def _extend(
     ordinal: Tensor,
     shift: Tensor,
 ) -> tuple[_Vertices, dict[str, Tensor]]:
-    """Return the next vertices of the paths that hit the surface again, and the weights (N, 1) of those paths."""
+    """Return the next vertices of the paths that hit the surface again, and the weights (N, 1) of
+    those paths.
+    """
     normals = torch.from_numpy(vertices.hits.normal)
     direction, density = draw_directions(normals, vertices.back, ordinal, shift)
     n_dot_w = (normals * direction).sum(-1, keepdim=True)
@@ -211,7 +237,8 @@ def _gather(
             shaded = material.take(vertices.patches[some]).shade(cosines, n_dot_v, l_dot_v)
             spread = torch.zeros(len(pixels), len(place))
             spread[place, torch.arange(len(place))] = weights[name][some, 0]
-            # Limit the contribution of one path, relative to its expected share. Larger values are only noise.
+            # Limit the contribution of one path, relative to its expected share. Larger values are
+            # only noise.
             radiance[name][pixels] += spread @ shaded.clamp(max=8.0)
 
 
@@ -219,18 +246,24 @@ LOBES = (0.0, 0.1, 0.0, 0.35)
 """Widths (roughness squared) of the lobes of four successive directions; 0 is the cosine lobe."""
 
 
-def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the horizon.
+def draw_directions(
+    normals: Tensor, back: Tensor, first: Tensor, shift: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the
+    horizon.
 
-    The surface normals and the directions `back` to the previous vertices of the paths are (N, 3), unit. `first` (N,)
-    int64 is the index of the direction within its pixel. It selects the lobe and the point of the R2 sequence (Roberts
-    2018), which covers the lobe evenly. `shift` (N, 2) is the offset of the pixel in the sequence.
+    The surface normals and the directions `back` to the previous vertices of the paths are (N, 3),
+    unit. `first` (N,) int64 is the index of the direction within its pixel. It selects the lobe and
+    the point of the R2 sequence (Roberts 2018), which covers the lobe evenly. `shift` (N, 2) is the
+    offset of the pixel in the sequence.
     """
     ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
     u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0
     v = (shift[:, 1] + ordinal * 0.5698402909980532) % 1.0
     tangent, bitangent = basis(normals)
-    local_view = torch.stack([(back * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1)
+    local_view = torch.stack(
+        [(back * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1
+    )
     lobe = first % len(LOBES)
     # Lobes of the same kind use different parts of the sequence.
     u = (u + lobe * 0.25) % 1.0
@@ -241,7 +274,9 @@ def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor)
     mirrored = 2 * (local_view * half).sum(-1, keepdim=True) * half - local_view
     local = torch.where(alpha == 0, matte, mirrored)
     world = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normals
-    return world, density(local[:, 2:], local_view[:, 2:], (local * local_view).sum(-1, keepdim=True))
+    return world, density(
+        local[:, 2:], local_view[:, 2:], (local * local_view).sum(-1, keepdim=True)
+    )
 
 
 def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
@@ -259,7 +294,9 @@ def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
 
 
 def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return two unit vectors (N, 3) that form a right-handed frame with each unit normal (Duff et al. 2017)."""
+    """Return two unit vectors (N, 3) that form a right-handed frame with each unit normal (Duff et
+    al. 2017).
+    """
     x, y, z = normals.unbind(dim=1)
     sign = torch.where(z >= 0, 1.0, -1.0)
     a = -1 / (sign + z)
@@ -276,7 +313,8 @@ def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor
     first, second = basis(stretched)
     radius, angle = u.sqrt(), 2 * math.pi * v
     across, along = radius * angle.cos(), radius * angle.sin()
-    # `second` must be the axis along which the horizon cuts the disc, the axis closer to the normal.
+    # `second` must be the axis along which the horizon cuts the disc, the axis closer to the
+    # normal.
     upward = torch.stack((first[:, 2], second[:, 2]), dim=1)
     length = upward.norm(dim=1, keepdim=True).clamp(min=1e-6)
     cosine, sine = (upward / length).unbind(dim=1)
@@ -291,8 +329,12 @@ def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor
     )
 
 
-MATERIALS = {f"{name}{suffix}": kinds for suffix in ("", "-2", "-3") for name, kinds in CLASSES.items()}
-"""The material sets of a scene, each with the range of the number that selects the kind; see draw_material."""
+MATERIALS = {
+    f"{name}{suffix}": kinds for suffix in ("", "-2", "-3") for name, kinds in CLASSES.items()
+}
+"""The material sets of a scene, each with the range of the number that selects the kind; see
+draw_material.
+"""
 
 MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewing direction
 
@@ -305,7 +347,8 @@ class SceneConfig:
     lights: int = 100  # F, the number of lights
     samples: int = 3  # k of the k x k samples per pixel
     directions: int = 96  # number of paths per pixel for indirect light
-    bounces: int = 4  # largest number of reflections before the visible surface; 0 for direct light only
+    # largest number of reflections before the visible surface; 0 for direct light only
+    bounces: int = 4
 
 
 @dataclass(frozen=True)
@@ -315,7 +358,8 @@ class Scene:
     shape: str  # kind of the shape
     mesh: Mesh  # the shape
     lights: Floats  # (F, 3), unit directions towards the lights
-    materials: dict[str, PrincipledMaterial]  # by the names in MATERIALS, with one row per patch of the surface
+    # by the names in MATERIALS, with one row per patch of the surface
+    materials: dict[str, PrincipledMaterial]
     patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
     seed: int  # seed of the paths of indirect light
     relief: Relief | None = None  # on the surface
@@ -327,25 +371,34 @@ class RenderedScene:
 
     mask: NDArray[np.bool_]  # (H, W)
     normals: Floats  # (P, 3), unit; pixels row-major
-    # by the names in MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light and fills the pixel
+    # by the names in MATERIALS, (P, F) float32; 1 is a matte white surface that faces the light and
+    # fills the pixel
     observations: dict[str, Floats]
 
 
 def draw_scene(
-    seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None, reliefs: Sequence[Path] = ()
+    seed: int,
+    index: int,
+    config: SceneConfig,
+    mesh: Mesh | None = None,
+    reliefs: Sequence[Path] = (),
 ) -> Scene:
-    """Draw scene number `index` of the set with this seed, with the given mesh or, for None, a random shape.
+    """Draw scene number `index` of the set with this seed, with the given mesh or, for None, a
+    random shape.
 
     Half of the scenes get a relief from one of the normal maps, if any are given; see draw_detail.
 
-    The surface has one patch in 60 % of the scenes, as real objects have one or few materials, 2 to 12 in 25 %, and 20
-    to 3,000 in 15 %. In half of the scenes the patches differ only in their base colour, as on a painted or printed
-    object of uniform gloss. Raises UsageError if the extra `render` is not installed.
+    The surface has one patch in 60 % of the scenes, as real objects have one or few materials, 2 to
+    12 in 25 %, and 20 to 3,000 in 15 %. In half of the scenes the patches differ only in their base
+    colour, as on a painted or printed object of uniform gloss. Raises UsageError if the extra
+    `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
     kind = rng.random()
-    patches = 1 if kind < 0.6 else int(rng.integers(2, 13) if kind < 0.85 else rng.integers(20, 3001))
+    patches = (
+        1 if kind < 0.6 else int(rng.integers(2, 13) if kind < 0.85 else rng.integers(20, 3001))
+    )
     one_gloss = rng.random() < 0.5
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     render_seed = int(rng.integers(2**62))
@@ -361,12 +414,17 @@ def draw_scene(
     own = np.random.default_rng([seed, index, 1])
     relief = None
     if reliefs and own.random() < 0.5:
-        relief = draw_detail(read_relief(reliefs[int(own.integers(len(reliefs)))]), config.size, own)
+        relief = draw_detail(
+            read_relief(reliefs[int(own.integers(len(reliefs)))]), config.size, own
+        )
     return Scene(shape, mesh, lights, materials, patch_of_face, render_seed, relief)
 
 
-def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
-    """Render the scene in all its materials. `progress` is called with the finished share, from 0 to 1.
+def render_scene(
+    scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None
+) -> RenderedScene:
+    """Render the scene in all its materials. `progress` is called with the finished share, from 0
+    to 1.
 
     Raises UsageError if the extra `render` is not installed.
     """
@@ -388,14 +446,16 @@ def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], 
             )
             for name, received in indirect.items():
                 radiance[name] += received
-    return RenderedScene(visible.mask, visible.normals, {name: values.numpy() for name, values in radiance.items()})
+    return RenderedScene(
+        visible.mask, visible.normals, {name: values.numpy() for name, values in radiance.items()}
+    )
 
 
 def draw_lights(count: int, rng: np.random.Generator) -> Floats:
     """Draw light directions (count, 3), about uniform over the upper hemisphere.
 
-    They are a Fibonacci spiral (Gonzalez 2010), rotated by a random angle. Each light is then moved by a third of
-    the mean distance.
+    They are a Fibonacci spiral (Gonzalez 2010), rotated by a random angle. Each light is then moved
+    by a third of the mean distance.
     """
     order = np.arange(count)
     z = 1 - (1 - MIN_LIGHT_Z) * (order + 0.5) / count

@@ -1,9 +1,10 @@
-"""Random shapes with folds, hollows and occlusions like those found in sculptures, and the relief on their surface.
+"""Random shapes with folds, hollows and occlusions like those found in sculptures, and the relief
+on their surface.
 
-Shapes are built from signed distance fields. Unions of round blobs alone would be too convex, with few cast shadows and
-interreflections. Relief is a tileable normal map that perturbs the visible normals, because meshes are smooth from one
-pixel to the next. Stone, cloth and leather are not, and networks trained without such detail smooth it away. Relief
-does not affect the shadows.
+Shapes are built from signed distance fields. Unions of round blobs alone would be too convex, with
+few cast shadows and interreflections. Relief is a tileable normal map that perturbs the visible
+normals, because meshes are smooth from one pixel to the next. Stone, cloth and leather are not, and
+networks trained without such detail smooth it away. Relief does not affect the shadows.
 """
 
 from __future__ import annotations
@@ -20,21 +21,32 @@ from splinecli.capture.formats.images import read_image
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis import meshes
-from splinecli.workshop.synthesis.meshes import LONGEST_EDGE, Floats, Mesh, fit_to_frame, read_mesh, split_long_edges
+from splinecli.workshop.synthesis.meshes import (
+    LONGEST_EDGE,
+    Floats,
+    Mesh,
+    fit_to_frame,
+    read_mesh,
+    split_long_edges,
+)
 
 SPACING = 0.0125
-"""Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
+"""Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156
+apart.
+"""
 
-FEWEST_FACES = 5_000  # meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces
+# meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces
+FEWEST_FACES = 5_000
 
 
 def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[str, Mesh]:
-    """Draw a random shape, fitted into the camera's frame, and return the name of its kind and its mesh.
+    """Draw a random shape, fitted into the camera's frame, and return the name of its kind and its
+    mesh.
 
-    40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise), 15 % relief (folded
-    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera). `place`, from 0
-    to 1, determines the kind: evenly spread values give a set the right share of each. Raises UsageError if the extra
-    `render` is not installed.
+    40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise),
+    15 % relief (folded slabs that fill the frame), and 25 % vessels (bowls and cups that show their
+    inside to the camera). `place`, from 0 to 1, determines the kind: evenly spread values give a
+    set the right share of each. Raises UsageError if the extra `render` is not installed.
     """
     place = rng.random() if place is None else place
     name = list(KINDS)[int(np.searchsorted(np.cumsum((0.4, 0.2, 0.15)), place, side="right"))]
@@ -42,7 +54,9 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
 
 
 def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
-    """Draw a random shape of one kind: `carved`, `rough`, `relief` or `vessel`. Raises like draw_shape."""
+    """Draw a random shape of one kind: `carved`, `rough`, `relief` or `vessel`. Raises like
+    draw_shape.
+    """
     while True:
         mesh = KINDS[name](rng)
         if mesh is not None and len(mesh.faces) > FEWEST_FACES:
@@ -65,29 +79,40 @@ def turn(mesh: Mesh, rotation: Floats) -> Mesh:
 def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> Mesh:
     """Draw a random view of a mesh that fits the frame.
 
-    The rotation is uniform. In half of the views another mesh, from one of the files `others` and scaled by U(0.4, 1),
-    touches it, because gaps between bodies have long shadows and indirect light. Half of the views are magnified by
-    U(1, 2.2) around a point on the surface, so that they show only a part.
+    The rotation is uniform. In half of the views another mesh, from one of the files `others` and
+    scaled by U(0.4, 1), touches it, because gaps between bodies have long shadows and indirect
+    light. Half of the views are magnified by U(1, 2.2) around a point on the surface, so that they
+    show only a part.
     """
     mesh = turn(mesh, draw_rotation(rng))
     if others and rng.random() < 0.5:
-        mesh = _touching(mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng)
+        mesh = _touching(
+            mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng
+        )
     mesh = fit_to_frame(mesh)
     if rng.random() < 0.5:
         # A view is magnified by up to this factor.
         enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
         shift = np.append(middle * (1 - enlarged), 0)
-        mesh = Mesh((mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals)
+        mesh = Mesh(
+            (mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals
+        )
     return split_long_edges(mesh, longest=LONGEST_EDGE)
 
 
 def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return both meshes, the other one scaled down and moved in a random direction to overlap by 40 % at most."""
+    """Return both meshes, the other one scaled down and moved in a random direction to overlap by
+    40 % at most.
+    """
     direction = rng.normal(size=3) * np.array((1, 1, 0.5))
     direction /= np.linalg.norm(direction)
     vertices = other.vertices * rng.uniform(0.4, 1.0)
     depth = np.ptp(vertices @ direction)
-    apart = (mesh.vertices @ direction).max() - (vertices @ direction).min() - rng.uniform(0, 0.4) * depth
+    apart = (
+        (mesh.vertices @ direction).max()
+        - (vertices @ direction).min()
+        - rng.uniform(0, 0.4) * depth
+    )
     return Mesh(
         np.concatenate((mesh.vertices, vertices + apart * direction)).astype(np.float32),
         np.concatenate((mesh.faces, other.faces + len(mesh.vertices))).astype(np.int32),
@@ -116,9 +141,16 @@ Range = tuple[float, float]
 
 
 def _draw_waves(
-    rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1, ridged: bool = False
+    rng: np.random.Generator,
+    frequencies: Range,
+    slopes: Range,
+    *,
+    outputs: int = 1,
+    ridged: bool = False,
 ) -> meshes.Field:
-    """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its mean slope."""
+    """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its
+    mean slope.
+    """
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / ((4 if ridged else 2) * np.pi * frequency))
     noise = meshes.ridges(rng, frequency) if ridged else meshes.waves(rng, frequency, outputs)
@@ -129,9 +161,17 @@ _draw_folds = partial(_draw_waves, ridged=True)
 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:
-    """Draw a union of three to seven warped solids with three to eight pieces cut out, often with folds."""
-    solids = [_place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))]
-    tools = [_place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7)) for _ in range(rng.integers(3, 9))]
+    """Draw a union of three to seven warped solids with three to eight pieces cut out, often with
+    folds.
+    """
+    solids = [
+        _place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5))
+        for _ in range(rng.integers(3, 8))
+    ]
+    tools = [
+        _place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7))
+        for _ in range(rng.integers(3, 9))
+    ]
     blend, seam = rng.uniform(0.05, 0.25), rng.uniform(0.02, 0.08)
     bend = _draw_waves(rng, (0.4, 0.9), (0.1, 0.5), outputs=3)
     folds = _draw_folds(rng, (0.9, 2.2), (0.2, 0.8)) if rng.random() < 0.55 else None
@@ -157,7 +197,11 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
     craters = [
         _place(
-            meshes.ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
+            meshes.ellipsoid(
+                (rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)
+            ),
+            rng,
+            (0.5, 0.8),
         )
         for _ in range(rng.integers(0, 9))
     ]
@@ -176,9 +220,15 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
 
 def draw_relief(rng: np.random.Generator) -> Mesh | None:
     """Draw a slab that fills the frame, folded into ridges, valleys and overhangs."""
-    swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
+    swell, folds = (
+        _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)),
+        _draw_folds(rng, (0.45, 1.2), (0.4, 1.3)),
+    )
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
-    pits = [_place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))]
+    pits = [
+        _place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0))
+        for _ in range(rng.integers(0, 6))
+    ]
     slab = meshes.box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
 
     def distance(points: Floats) -> Floats:
@@ -194,7 +244,9 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
 
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
-    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further solids."""
+    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further
+    solids.
+    """
     from scipy.spatial.transform import Rotation
 
     half_height = rng.uniform(0.3, 0.75)
@@ -203,7 +255,10 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     flutes, twist = int(rng.integers(3, 13)), rng.uniform(-2, 2)
     depth = rng.uniform(0.1, 0.5) / flutes if rng.random() < 0.5 else 0.0
     folds = _draw_folds(rng, (0.8, 2.0), (0.1, 0.4)) if rng.random() < 0.5 else None
-    extras = [_place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6)) for _ in range(rng.integers(0, 4))]
+    extras = [
+        _place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6))
+        for _ in range(rng.integers(0, 4))
+    ]
     if rng.random() < 0.5:
         extras = []
     floor = np.float32(-half_height + 2 * wall)
@@ -226,17 +281,23 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
         return None
     tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     towards_azimuth = tilt * np.array((-np.sin(azimuth), np.cos(azimuth), 0))
-    return fit_to_frame(turn(mesh, Rotation.from_rotvec(towards_azimuth).as_matrix().astype(np.float32)))
+    return fit_to_frame(
+        turn(mesh, Rotation.from_rotvec(towards_azimuth).as_matrix().astype(np.float32))
+    )
 
 
 def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
-    """Draw the radius over the height from -1 to 1, a smooth curve through five radii; half widen towards the mouth."""
+    """Draw the radius over the height from -1 to 1, a smooth curve through five radii; half widen
+    towards the mouth.
+    """
     from scipy.interpolate import PchipInterpolator
 
     radii = rng.uniform(0.35, 0.9, 5)
     if rng.random() < 0.5:
         radii = np.sort(radii)
-    table = PchipInterpolator(np.linspace(-1, 1, 5), radii)(np.linspace(-1, 1, 256)).astype(np.float32)
+    table = PchipInterpolator(np.linspace(-1, 1, 5), radii)(np.linspace(-1, 1, 256)).astype(
+        np.float32
+    )
     return lambda height: np.interp(height, np.linspace(-1, 1, 256), table).astype(np.float32)
 
 
@@ -253,24 +314,31 @@ _STEEPEST = 4.0  # largest slope read from a normal map
 
 
 def read_relief(path: Path) -> Floats:
-    """Read a tileable normal map, RGB = (n + 1) / 2, as the slopes (h, w, 2) of its height along its columns and rows.
+    """Read a tileable normal map, RGB = (n + 1) / 2, as the slopes (h, w, 2) of its height along
+    its columns and rows.
 
-    The direction of green, up or down, is inferred from the slopes, because the slopes of a surface have no curl. The
-    vectors need not have unit length. Raises InputError if the file is not a colour image.
+    The direction of green, up or down, is inferred from the slopes, because the slopes of a surface
+    have no curl. The vectors need not have unit length. Raises InputError if the file is not a
+    colour image.
     """
     normals = 2 * read_image(path) - 1
     if normals.shape[2] != 3:
         raise InputError("found a gray image, expected a normal map", path=path)
     slopes = -normals[..., :2] / np.maximum(normals[..., 2:], 1 / _STEEPEST)
     slopes = (slopes - slopes.mean(axis=(0, 1))).clip(-_STEEPEST, _STEEPEST)
-    along_rows, along_columns = np.gradient(slopes[..., 0], axis=0), np.gradient(slopes[..., 1], axis=1)
+    along_rows, along_columns = (
+        np.gradient(slopes[..., 0], axis=0),
+        np.gradient(slopes[..., 1], axis=1),
+    )
     down = np.square(along_rows - along_columns).sum() < np.square(along_rows + along_columns).sum()
     return np.asarray(slopes if down else slopes * np.array((1, -1)), np.float32)
 
 
 @dataclass(frozen=True)
 class Relief:
-    """A relief, projected along three axes: each point of a surface uses the axis nearest to its normal."""
+    """A relief, projected along three axes: each point of a surface uses the axis nearest to its
+    normal.
+    """
 
     slopes: Floats  # (h, w, 2), slopes of the height along the columns and the rows
     axes: Floats  # (3, 3), orthonormal rows
@@ -287,7 +355,8 @@ class Relief:
         height, width = self.slopes.shape[:2]
         columns, lines = (places[rows, axis] % 1 for axis in (first, second))
         slopes = self.slopes[
-            np.minimum((lines * height).astype(int), height - 1), np.minimum((columns * width).astype(int), width - 1)
+            np.minimum((lines * height).astype(int), height - 1),
+            np.minimum((columns * width).astype(int), width - 1),
         ]
         rise = slopes[:, :1] * self.axes[first] + slopes[:, 1:] * self.axes[second]
         rise -= (rise * normals).sum(axis=1, keepdims=True) * normals
@@ -300,12 +369,14 @@ class Relief:
 def draw_detail(slopes: Floats, size: int, rng: np.random.Generator) -> Relief:
     """Draw a relief from the slopes of a normal map, for images of `size` pixels a side.
 
-    A tile is 10^U(-0.6, 0.4) wide, in units of half the frame. The root mean square of the slopes, at a resolution of a
-    third of a pixel, is U(0.05, 0.6). The axes are uniform over all rotations.
+    A tile is 10^U(-0.6, 0.4) wide, in units of half the frame. The root mean square of the slopes,
+    at a resolution of a third of a pixel, is U(0.05, 0.6). The axes are uniform over all rotations.
     """
     period = float(10 ** rng.uniform(-0.6, 0.4))
     side = max(8, round(1.5 * size * period))
     if side < min(slopes.shape[:2]):
         slopes = np.asarray(cv2.resize(slopes, (side, side), interpolation=cv2.INTER_AREA))
-    steepness = rng.uniform(0.05, 0.6) / max(float(np.sqrt(np.square(slopes).sum(axis=2).mean())), 1e-3)
+    steepness = rng.uniform(0.05, 0.6) / max(
+        float(np.sqrt(np.square(slopes).sum(axis=2).mean())), 1e-3
+    )
     return Relief(slopes * np.float32(steepness), draw_rotation(rng), period)

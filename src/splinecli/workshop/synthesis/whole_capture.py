@@ -1,11 +1,13 @@
-"""Simulation of whole captures, with a background behind the object, a camera, and faults common to all pixels.
+"""Simulation of whole captures, with a background behind the object, a camera, and faults common to
+all pixels.
 
-Rendered scenes have little pixel-scale curvature. Engraved pieces do, which are plates and half ellipsoids, smooth or
-with detail of a few pixels, but without cast shadows or interreflection.
+Rendered scenes have little pixel-scale curvature. Engraved pieces do, which are plates and half
+ellipsoids, smooth or with detail of a few pixels, but without cast shadows or interreflection.
 
-The camera between the object and the files has a lens, a Bayer pattern, sharpening and JPEG. These effects and
-translucent materials mix neighbouring pixels, so they act on whole images (F, H, W) of linear radiance, background
-included. Each draw documents its distribution. Faults that affect each pixel separately are in batches.py.
+The camera between the object and the files has a lens, a Bayer pattern, sharpening and JPEG. These
+effects and translucent materials mix neighbouring pixels, so they act on whole images (F, H, W) of
+linear radiance, background included. Each draw documents its distribution. Faults that affect each
+pixel separately are in batches.py.
 """
 
 from __future__ import annotations
@@ -35,22 +37,28 @@ class Optics:
 
     kernels: Tensor  # (3, k, k), the blur of red, green and blue, each with the sum 1
     weights: tuple[float, float, float]  # of red, green and blue in the gray value, with the sum 1
-    demosaic: int | None  # OpenCV's code for the Bayer interpolation; None for a sensor without a Bayer pattern
+    # OpenCV's code for the Bayer interpolation; None for a sensor without a Bayer pattern
+    demosaic: int | None
     sharpening: float  # amount of the unsharp mask, 0 for none
     sharpening_sigma: float  # its width in pixels
     jpeg_quality: int | None  # None for no JPEG
 
     def through_lens(self, images: Tensor) -> Tensor:
-        """Return the red, green and blue irradiance on the sensor (3, F, H, W) for radiance (F, H, W)."""
+        """Return the red, green and blue irradiance on the sensor (3, F, H, W) for radiance (F, H,
+        W).
+        """
         return torch.stack([_blurred(images, kernel) for kernel in self.kernels])
 
     def develop(self, colours: Tensor) -> Tensor:
-        """Return the gray images (F, H, W), 0 to 1, from the noisy sensor exposure (3, F, H, W), 0 to 1."""
+        """Return the gray images (F, H, W), 0 to 1, from the noisy sensor exposure (3, F, H, W), 0
+        to 1.
+        """
         if self.demosaic is not None:
             pattern = colours[1].clone()  # red, green / green, blue
             pattern[:, ::2, ::2] = colours[0, :, ::2, ::2]
             pattern[:, 1::2, 1::2] = colours[2, :, 1::2, 1::2]
-            stored = (pattern.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)  # OpenCV interpolates integers
+            # OpenCV interpolates integers
+            stored = (pattern.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)
             found = np.stack([cv2.cvtColor(image, self.demosaic) for image in stored])
             colours = torch.from_numpy(found.astype(np.float32) / 65535).permute(3, 0, 1, 2)
         gray = torch.einsum("c,cfhw->fhw", torch.tensor(self.weights), colours)
@@ -60,7 +68,9 @@ class Optics:
         return gray.clamp(0, 1)
 
     def compress(self, images: Tensor) -> Tensor:
-        """Return the linear values of images (F, H, W), 0 to 1, after JPEG compression with the sRGB curve."""
+        """Return the linear values of images (F, H, W), 0 to 1, after JPEG compression with the
+        sRGB curve.
+        """
         if self.jpeg_quality is None:
             return images
         encoded = encode_srgb(images.numpy())
@@ -73,11 +83,12 @@ class Optics:
 def draw_optics(generator: torch.Generator) -> Optics:
     """Draw a camera.
 
-    Blur: none in 15 % of the captures, else with a standard deviation of U(0, 1.2) pixels, a Gaussian or, in a third,
-    the disc of defocus. The widths of red, green and blue differ by U(-8, 8) % each. Bayer pattern: in half of
-    the captures, of which half are interpolated bilinearly, the others along edges. Object colour and gray weights,
-    combined: U(0.2, 1) for each of red, green and blue. Sharpening: in 20 %, an unsharp mask of U(0.2, 1) with a sigma
-    of U(0.6, 1.5) pixels. JPEG, for 8-bit captures: in a third, with a quality of U(75, 98).
+    Blur: none in 15 % of the captures, else with a standard deviation of U(0, 1.2) pixels, a
+    Gaussian or, in a third, the disc of defocus. The widths of red, green and blue differ by U(-8,
+    8) % each. Bayer pattern: in half of the captures, of which half are interpolated bilinearly,
+    the others along edges. Object colour and gray weights, combined: U(0.2, 1) for each of red,
+    green and blue. Sharpening: in 20 %, an unsharp mask of U(0.2, 1) with a sigma of U(0.6, 1.5)
+    pixels. JPEG, for 8-bit captures: in a third, with a quality of U(75, 98).
     """
     uniform = partial(draw_number, generator)
     sigma = uniform(0, 1.2) * (uniform() >= 0.15)
@@ -91,7 +102,9 @@ def draw_optics(generator: torch.Generator) -> Optics:
     return Optics(
         kernels=torch.stack(kernels),
         weights=(red / total, green / total, blue / total),
-        demosaic=(cv2.COLOR_BayerRGGB2RGB if bayer < 0.25 else cv2.COLOR_BayerRGGB2RGB_EA) if bayer < 0.5 else None,
+        demosaic=(cv2.COLOR_BayerRGGB2RGB if bayer < 0.25 else cv2.COLOR_BayerRGGB2RGB_EA)
+        if bayer < 0.5
+        else None,
         sharpening=uniform(0.2, 1) * (uniform() < 0.2),
         sharpening_sigma=uniform(0.6, 1.5),
         jpeg_quality=round(uniform(75, 98)) if uniform() < 1 / 3 else None,
@@ -99,7 +112,9 @@ def draw_optics(generator: torch.Generator) -> Optics:
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
-    """Return a Gaussian (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either axis."""
+    """Return a Gaussian (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either
+    axis.
+    """
     reach = math.ceil(3 * sigma)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / max(sigma, 1e-3)) ** 2)
     kernel = weights[:, None] * weights
@@ -107,7 +122,9 @@ def gaussian_kernel(sigma: float) -> Tensor:
 
 
 def disc_kernel(sigma: float) -> Tensor:
-    """Return a disc (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either axis."""
+    """Return a disc (k, k) with the sum 1 and a standard deviation of `sigma` pixels on either
+    axis.
+    """
     radius, finer = 2 * sigma, 5  # samples per pixel and axis
     reach = math.ceil(radius)
     places = (torch.arange((2 * reach + 1) * finer) + 0.5) / finer - 0.5 - reach
@@ -117,10 +134,11 @@ def disc_kernel(sigma: float) -> Tensor:
 
 
 def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
-    """Return radiance (F, H, W) of an object (H, W) whose material scatters light below its surface.
+    """Return radiance (F, H, W) of an object (H, W) whose material scatters light below its
+    surface.
 
-    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry: a Gaussian with a sigma of
-    U(1, 4) pixels. Light does not scatter out of the object.
+    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry: a
+    Gaussian with a sigma of U(1, 4) pixels. Light does not scatter out of the object.
     """
     share, kernel = draw_number(generator, 0.3, 1), gaussian_kernel(draw_number(generator, 1, 4))
     inside = mask[None].float()
@@ -129,7 +147,9 @@ def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
-    """Return images (F, H, W), convolved with a kernel (k, k); the border values are extended outwards."""
+    """Return images (F, H, W), convolved with a kernel (k, k); the border values are extended
+    outwards.
+    """
     if len(kernel) == 1:
         return images
     reach = len(kernel) // 2
@@ -140,18 +160,22 @@ def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
 def draw_engraved(
     size: int, lights: Tensor, generator: torch.Generator, *, round_share: float = 1 / 3
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size) with P true pixels.
+    """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size)
+    with P true pixels.
 
-    `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the
-    frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has
-    one kind of detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or curved; facets of 3 to
-    20 pixels; or a random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6),
-    a third as large for the texture. A third of the pieces are smooth. The material comes from draw_material, with 1 to
-    300 patches; in half of the pieces, the patches differ only in their base colour. The lights (F, 3) are unit.
+    `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are
+    plates that fill the frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames
+    and slopes of up to 0.3. Each piece has one kind of detail: grooves U(1, 6) pixels wide to
+    either side, regular or not, straight or curved; facets of 3 to 20 pixels; or a random texture
+    with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third as
+    large for the texture. A third of the pieces are smooth. The material comes from draw_material,
+    with 1 to 300 patches; in half of the pieces, the patches differ only in their base colour. The
+    lights (F, 3) are unit.
     """
     uniform = partial(draw_number, generator)
     normals, mask = _draw_base(size, round_share, generator)
-    # A third of the pieces have no detail, because smooth surfaces must stay smooth whatever their material.
+    # A third of the pieces have no detail, because smooth surfaces must stay smooth whatever their
+    # material.
     if uniform() >= 1 / 3:
         detail = _draw_detail(size, generator)
         normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
@@ -167,7 +191,9 @@ def draw_engraved(
 
 
 def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw a half ellipsoid or a plate; return its unit normals (size^2, 3) and its mask (size^2,)."""
+    """Draw a half ellipsoid or a plate; return its unit normals (size^2,
+    3) and its mask (size^2,).
+    """
     uniform = partial(draw_number, generator)
     places = _places(size)
     if uniform() < round_share:
@@ -206,14 +232,18 @@ def _draw_detail(size: int, generator: torch.Generator) -> Tensor:
         return steepness * side[:, None] * direction
     if kind == 1:
         count = int((size / uniform(3, 20)) ** 2) + 1
-        return (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
+        return (steepness * torch.randn(count, 2, generator=generator))[
+            _cells(count, size, generator)
+        ]
     grain = _smooth(torch.randn(2, size, size, generator=generator), uniform(0.4, 1.5))
     return steepness / 3 * (grain / grain.std()).view(2, -1).T
 
 
 def _places(size: int) -> Tensor:
     """Return the positions (size^2, 2) of the pixels, y up."""
-    rows, columns = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    rows, columns = torch.meshgrid(
+        torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij"
+    )
     return torch.stack((columns, -rows), dim=-1).view(-1, 2)
 
 
@@ -246,9 +276,11 @@ def photograph_captures(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph pixels of the G captures set by the configuration; pixel p belongs to capture p % G.
+    """Photograph pixels of the G captures set by the configuration; pixel p belongs to capture p %
+    G.
 
-    See `photograph_scene` for the arguments. All pixels of a capture have the same directions, valid ones first.
+    See `photograph_scene` for the arguments. All pixels of a capture have the same directions,
+    valid ones first.
     """
     if config.capture_pixels == 1:
         return batches.photograph(truth, radiance, directions, valid, config, generator)
@@ -263,7 +295,10 @@ def photograph_captures(
         seen, found, factor = photograph_scene(
             radiance[rows, lights].cpu(), directions[capture, lights].cpu(), config, own
         )
-        observations[rows, lights], calibrated[rows, lights] = seen.to(radiance), found.to(directions)
+        observations[rows, lights], calibrated[rows, lights] = (
+            seen.to(radiance),
+            found.to(directions),
+        )
         exposure[rows] = factor
     return PixelBatch(observations, calibrated, valid, truth, exposure, captures)
 
@@ -275,33 +310,37 @@ def photograph_scene(
     generator: torch.Generator,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, float]:
-    """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture shares.
+    """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture
+    shares.
 
-    Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the factor from the
-    radiance to the observations. With a mask (H, W), the radiance (H * W, F) is of whole images with a background, and
-    the observations are of the mask's pixels.
+    Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the
+    factor from the radiance to the observations. With a mask (H, W), the radiance (H * W, F) is of
+    whole images with a background, and the observations are of the mask's pixels.
 
-    Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the lights, as from room
-    light, and of the capture's mean, as from lens glare; see `_ambient`.
+    Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the
+    lights, as from room light, and of the capture's mean, as from lens glare; see `_ambient`.
 
-    The functions of synthesis/batches.py draw faults for each row. Here the whole capture is one row. The exposure
-    places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of
-    the observations are clipped, and restored as in `infer`. A third of the captures with sensor noise also have grain:
-    each observation is multiplied by its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture causes such grain
-    if images are shifted by a fraction of a pixel or light scatters between neighbours. Of the captures with intensity
-    errors, 30 % have an additional error with a sigma of U(0, 0.5) stops, as if the intensities had not been measured.
-    The normals are then wrong by many degrees, but their detail is still correct.
+    The functions of synthesis/batches.py draw faults for each row. Here the whole capture is one
+    row. The exposure places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In
+    `config.saturated_share` of the captures, 0.1 to 3 % of the observations are clipped, and
+    restored as in `infer`. A third of the captures with sensor noise also have grain: each
+    observation is multiplied by its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture
+    causes such grain if images are shifted by a fraction of a pixel or light scatters between
+    neighbours. Of the captures with intensity errors, 30 % have an additional error with a sigma of
+    U(0, 0.5) stops, as if the intensities had not been measured. The normals are then wrong by many
+    degrees, but their detail is still correct.
 
-    `config.optics_share` of the captures of images use a camera from draw_optics, which mixes neighbouring pixels.
-    Saturation and noise are applied at the sensor, before the Bayer pattern is interpolated. As in `infer`, the blur is
-    estimated and removed.
+    `config.optics_share` of the captures of images use a camera from draw_optics, which mixes
+    neighbouring pixels. Saturation and noise are applied at the sensor, before the Bayer pattern is
+    interpolated. As in `infer`, the blur is estimated and removed.
     """
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = batches.draw_light_intensities(1, lights, config.unequal_lights_share, generator)
     arriving = radiance * intensities + _ambient(radiance, config.ambient_share, uniform)
     saturated = uniform() < config.saturated_share
-    share = uniform(1e-3, 0.03) if saturated else 1e-3  # of the observations that are clipped, or nearly
+    # of the observations that are clipped, or nearly
+    share = uniform(1e-3, 0.03) if saturated else 1e-3
     around = None if mask is None else torch.from_numpy(surroundings(mask.numpy()))
     wanted: slice | Tensor = slice(None)
     if mask is not None and around is not None:
@@ -318,20 +357,30 @@ def photograph_scene(
     clipped = exposed >= 1
     if config.sensor_noise:
         grain = 10 ** uniform(-2.5, -1.2) * (uniform() < 1 / 3)
-        exposed = exposed * (1 + grain * torch.randn(exposed.shape[-3:], generator=generator)).clamp(min=0)
+        exposed = exposed * (
+            1 + grain * torch.randn(exposed.shape[-3:], generator=generator)
+        ).clamp(min=0)
         exposed = batches.add_sensor_noise(exposed.reshape(1, -1), generator).view_as(exposed)
     is_jpeg = False
     if optics is not None:
         exposed, clipped = optics.develop(exposed), clipped.any(dim=0)
-        is_jpeg = config.sensor_noise and optics.jpeg_quality is not None and uniform() < config.eight_bit_share
+        is_jpeg = (
+            config.sensor_noise
+            and optics.jpeg_quality is not None
+            and uniform() < config.eight_bit_share
+        )
         exposed = (optics.compress(exposed) if is_jpeg else exposed).flatten(1).T[wanted]
         clipped = clipped.flatten(1).T[wanted]
     elif mask is not None:
         exposed, clipped = exposed[wanted], clipped[wanted]
     if config.sensor_noise and not is_jpeg:
-        exposed = batches.quantise(exposed.reshape(1, -1), config.eight_bit_share, generator).view_as(exposed)
+        exposed = batches.quantise(
+            exposed.reshape(1, -1), config.eight_bit_share, generator
+        ).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
-    errors = batches.disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
+    errors = batches.disturb_light_intensities(
+        torch.ones(1, lights), config.light_intensity_error_share, generator
+    )
     if uniform() < 0.3 * config.light_intensity_error_share:
         errors = errors * 2 ** (uniform(0, 0.5) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
@@ -340,7 +389,9 @@ def photograph_scene(
         remove_blur(values, mask.numpy(), around.numpy())
         pixels = slice(0, int(mask.sum()))
         observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
-    calibrated = batches.disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
+    calibrated = batches.disturb_light_directions(
+        directions[None], config.light_direction_error_share, generator
+    )[0]
     if saturated:
         values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
@@ -349,25 +400,29 @@ def photograph_scene(
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:
-    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds in `photograph_scene`.
+    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds in
+    `photograph_scene`.
 
-    Light transport is linear, so the mean over the lights is the radiance in a uniformly bright room. It is about half
-    of the albedo, so the levels match draw_ambient in pixels.py.
+    Light transport is linear, so the mean over the lights is the radiance in a uniformly bright
+    room. It is about half of the albedo, so the levels match draw_ambient in pixels.py.
     """
     level = 10 ** uniform(-3.2, -1.0) * (uniform() < share)
     return level * torch.lerp(radiance.mean(dim=1, keepdim=True), radiance.mean(), uniform())
 
 
-def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that includes some background.
+def add_background(
+    maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that
+    includes some background.
 
-    Real masks may include more than the object, and captures may have no mask. The maps of the object are radiance
-    (F, H, W) and unit normals (3, H, W), under unit lights (F, 3). The returned maps have zero for unknown normals: in
-    darkness, and under uneven light.
+    Real masks may include more than the object, and captures may have no mask. The maps of the
+    object are radiance (F, H, W) and unit normals (3, H, W), under unit lights (F, 3). The returned
+    maps have zero for unknown normals: in darkness, and under uneven light.
 
-    A third of the backgrounds are nearly dark. The others are plates from draw_engraved in the shadow of the object, at
-    a distance of up to half its size. Half of the plates are lit unevenly, as by near lamps. Half of the masks cover
-    everything, the others are up to 12 pixels too wide.
+    A third of the backgrounds are nearly dark. The others are plates from draw_engraved in the
+    shadow of the object, at a distance of up to half its size. Half of the plates are lit unevenly,
+    as by near lamps. Half of the masks cover everything, the others are up to 12 pixels too wide.
     """
     uniform = partial(draw_number, generator)
     sides = [int(uniform(0, 17)) for _ in range(4)]
@@ -383,7 +438,9 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
         normals, radiance, _ = draw_engraved(size, lights, generator, round_share=0.0)
         plate = torch.cat((radiance, normals), dim=1).T.view(-1, size, size)
         behind = plate[:, :height, :width].clone()
-        behind[:count] *= typical * 10 ** uniform(-1.5, 0.3) / radiance.amax(dim=1).median().clamp(min=1e-6)
+        behind[:count] *= (
+            typical * 10 ** uniform(-1.5, 0.3) / radiance.amax(dim=1).median().clamp(min=1e-6)
+        )
         behind[:count] *= ~_shadows(mask, lights, uniform(0, 0.5) * size)
         if uniform() < 0.5:
             rows, columns = torch.linspace(-1, 1, height)[:, None], torch.linspace(-1, 1, width)
@@ -398,12 +455,16 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
 
 
 def _shadows(mask: Tensor, lights: Tensor, distance: float) -> Tensor:
-    """Return the mask (F, H, W) of the shadow that the object casts on a plane `distance` pixels behind it."""
+    """Return the mask (F, H, W) of the shadow that the object casts on a plane `distance` pixels
+    behind it.
+    """
     reach = max(mask.shape)
     canvas = pad(mask, (reach,) * 4)
     found = []
     for x, y, z in lights.tolist():
-        right, down = (max(-reach, min(reach, round(distance * side / max(z, 1e-3)))) for side in (-x, y))
+        right, down = (
+            max(-reach, min(reach, round(distance * side / max(z, 1e-3)))) for side in (-x, y)
+        )
         top, left = reach - down, reach - right
         found.append(canvas[top : top + mask.shape[0], left : left + mask.shape[1]])
     return torch.stack(found)

@@ -1,4 +1,6 @@
-"""The settings of a training run in one frozen record, from presets by name, files and single settings."""
+"""The settings of a training run in one frozen record, from presets by name, files and single
+settings.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from splinecli.system.files import expanded, parse_json
 from splinecli.workshop.synthesis.pixels import PixelGeneratorConfig
 from splinecli.workshop.training import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 
-GENERATOR = "generator"  # the online pixel generator among the sources; every other name is the path of a pixel set
+# the online pixel generator among the sources; every other name is the path of a pixel set
+GENERATOR = "generator"
 Norm = Literal["mean", "sum"]  # whether the values of a map's cells are averaged or summed
 
 
@@ -29,20 +32,23 @@ class TrainingConfig:
     pixels: PixelGeneratorConfig = field(default_factory=PixelGeneratorConfig)
     # the sources of pixels and their weights. A weight is the source's share of the batches.
     sources: dict[str, NotNegative] = field(default_factory=lambda: {GENERATOR: 1.0})
-    start_from: str = ""  # name or file of the weights that the run starts from; empty for random ones
+    # name or file of the weights that the run starts from; empty for random ones
+    start_from: str = ""
     held_share: Share = 0.1  # share of the scenes of a pixel set that is for validation
     batch_size: Count = 256  # pixels a step; captures a step for the refinement net
-    # number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal numbers of
-    # lights. The number of processes must divide it.
+    # number of parts of a batch. The pixels of a shard come from one random stream and have nearly
+    # equal numbers of lights. The number of processes must divide it.
     shards: Count = 4
-    # "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates` steps for
-    # NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and trains the error head
-    # alone. "refine_net" fixes all these and trains the refinement nets on pixel sets of rendered scenes.
+    # "joint" updates both networks at each step. "alternating", as in the paper, makes
+    # `ne_net_updates` steps for NE-Net, then one for LI-Net, while the other network is fixed.
+    # "error_head" fixes both and trains the error head alone. "refine_net" fixes all these and
+    # trains the refinement nets on pixel sets of rendered scenes.
     updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
     ne_net_updates: Count = 5
-    learning_rate: NotNegative = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
-    # "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth for the last
-    # tenth of the run.
+    # the highest rate. It rises over `warmup_steps` and then falls.
+    learning_rate: NotNegative = 1.5e-3
+    # "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a
+    # tenth for the last tenth of the run.
     schedule: Literal["cosine", "stepped"] = "cosine"
     warmup_steps: Natural = 300
     # steps, minutes: the length of the run. If minutes is above 0, it replaces steps.
@@ -53,15 +59,18 @@ class TrainingConfig:
     beta2: BelowOne = 0.99
     weight_decay: NotNegative = 1e-3
     gradient_limit: NotNegative = 1.0  # largest norm of the gradient; 0 for none
-    average_decay: BelowOne = 0.9995  # decay of the running average of the weights, which is saved; 0 for none
-    # canonical networks train on pixels rotated by up to this angle, either way; half of the batches are mirrored.
-    # Estimates from several views can then be averaged.
+    # decay of the running average of the weights, which is saved; 0 for none
+    average_decay: BelowOne = 0.9995
+    # canonical networks train on pixels rotated by up to this angle, either way; half of the
+    # batches are mirrored. Estimates from several views can then be averaged.
     turn_jitter_deg: NotNegative = 15.0
-    # angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
+    # angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D
+    # - D_gt)|.
     angle_weight: NotNegative = 1.0
     map_weight: NotNegative = 1.0
     masked_weight: NotNegative = 1.0
-    # weight of the error of the differences between neighbours beside the angle, for the refinement nets
+    # weight of the error of the differences between neighbours beside the angle, for the refinement
+    # nets
     detail_weight: NotNegative = 1.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: NotNegative = 0.0
@@ -69,8 +78,8 @@ class TrainingConfig:
     # eta, lambda_c: settings of La
     eta: NotNegative = 1.0
     lambda_c: NotNegative = 50.0
-    # li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of LI-Net and in
-    # NE-Net's Ls and La. eta is in summed cells in either case.
+    # li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of
+    # LI-Net and in NE-Net's Ls and La. eta is in summed cells in either case.
     li_net_norm: Norm = "mean"
     ne_net_norm: Norm = "sum"
     # "bfloat16" runs the convolutions in bfloat16 where the device computes in it, "float32" never
@@ -81,12 +90,16 @@ class TrainingConfig:
         """Raise ModelError for settings that do not fit together."""
         if self.batch_size % self.shards:
             raise ModelError(
-                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards = {self.shards}"
+                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of"
+                f" shards = {self.shards}"
             )
         lights = self.pixels
-        if (pixels := self.batch_size // self.shards) % lights.captures(pixels) and self.updates != "refine_net":
+        if (pixels := self.batch_size // self.shards) % lights.captures(
+            pixels
+        ) and self.updates != "refine_net":
             raise ModelError(
-                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards * capture_pixels ="
+                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of"
+                " shards * capture_pixels ="
                 f" {self.shards * lights.capture_pixels}, or fewer"
             )
         if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
@@ -96,19 +109,22 @@ class TrainingConfig:
             )
         if self.network.grid != "even":
             raise ModelError(
-                f"network setting 'grid' is {self.network.grid!r}; training has true maps on the grid 'even' only"
+                f"network setting 'grid' is {self.network.grid!r}; training has true maps on the"
+                " grid 'even' only"
             )
         if self.updates == "alternating" and not self.network.interpolates:
             raise ModelError("training setting 'updates' is 'alternating', which needs a LI-Net")
         if (self.updates in ("error_head", "refine_net")) != self.network.error_head:
             raise ModelError(
                 f"training settings 'updates' and 'network.error_head' are {self.updates!r} and"
-                f" {self.network.error_head}; the updates 'error_head' and 'refine_net' need an error head, no others"
+                f" {self.network.error_head}; the updates 'error_head' and 'refine_net' need an"
+                " error head, no others"
             )
         if (self.updates == "refine_net") != self.network.refines:
             raise ModelError(
                 f"training settings 'updates' and 'network.refines' are {self.updates!r} and"
-                f" {self.network.refines}; the updates 'refine_net' need a refinement net, and only they train one"
+                f" {self.network.refines}; the updates 'refine_net' need a refinement net, and"
+                " only they train one"
             )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' has no weight above 0")
@@ -119,12 +135,17 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainingConfig:
-        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or an impossible value."""
+        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or an
+        impossible value.
+        """
         values = dict(values)
         for name, read in (("network", NetworkConfig.from_dict), ("pixels", _pixels)):
             if name in values:
                 if not isinstance(values[name], dict):
-                    raise ModelError(f"training setting {name!r} is {values[name]!r}; expected a table of settings")
+                    raise ModelError(
+                        f"training setting {name!r} is {values[name]!r}; expected a table of"
+                        " settings"
+                    )
                 values[name] = read(values[name])
         return cls(**settings(cls, values, "training setting", ModelError))
 
@@ -135,15 +156,20 @@ def _pixels(values: dict[str, Any]) -> PixelGeneratorConfig:
     for name in ("measured_share", "measured_materials"):
         if value := values.pop(name, None):
             raise ModelError(
-                f"training setting {name!r} is {value!r}, but training with measured materials was removed",
+                f"training setting {name!r} is {value!r}, but training with measured materials was"
+                " removed",
                 hint="Leave measured_share and measured_materials out",
             )
-    return PixelGeneratorConfig(**settings(PixelGeneratorConfig, values, "training setting", ModelError))
+    return PixelGeneratorConfig(
+        **settings(PixelGeneratorConfig, values, "training setting", ModelError)
+    )
 
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.
 # Half of the paper's cells a side: the set branch has the exact directions that larger cells round.
-_COMPACT = NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64, sees_capture=True)
+_COMPACT = NetworkConfig(
+    map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64, sees_capture=True
+)
 
 PRESETS = {
     "compact": TrainingConfig(
@@ -195,8 +221,15 @@ def preset(name: str, **changes: Any) -> TrainingConfig:
     return replace(PRESETS[name], **changes)
 
 
-CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")  # settings that may change when a run continues
-Settings = dict[str, Any]  # nested settings, as in TrainingConfig.to_dict; only some of them may be given
+# settings that may change when a run continues
+CHANGEABLE = (
+    "steps",
+    "minutes",
+    "learning_rate",
+    "gradient_limit",
+)
+# nested settings, as in TrainingConfig.to_dict; only some of them may be given
+Settings = dict[str, Any]
 
 
 def read_config_file(path: Path) -> Settings:
@@ -209,7 +242,9 @@ def read_config_file(path: Path) -> Settings:
     except RecursionError:
         raise ModelError("is nested too deeply", path=path) from None
     except ValueError as error:  # raised by both decoders
-        raise ModelError(f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path) from error
+        raise ModelError(
+            f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path
+        ) from error
     if not isinstance(values, dict):
         raise ModelError("is not a table of settings", path=path)
     return values
@@ -218,8 +253,8 @@ def read_config_file(path: Path) -> Settings:
 def parse_parameter(text: str) -> Settings:
     """Parse one setting: "a.b=value" gives {"a": {"b": value}}.
 
-    The value is read as TOML. A value that is not TOML is taken as text. Raises UsageError if there is no name or no
-    "=".
+    The value is read as TOML. A value that is not TOML is taken as text. Raises UsageError if there
+    is no name or no "=".
     """
     name, equals, value = text.partition("=")
     keys = [key.strip() for key in name.split(".")]
@@ -255,9 +290,10 @@ def configure(
 ) -> TrainingConfig:
     """Return a preset, changed by the settings of a file and then by `changes`, in their order.
 
-    A table of sources is replaced as a whole. Other tables are merged key by key. Without a name of a preset, the
-    file's entry "preset" counts, or else `base`, which is DEFAULT_PRESET for None. Raises UsageError if there is no
-    such preset, or ModelError if a setting is unknown or its value is not allowed. The message names the file it is in.
+    A table of sources is replaced as a whole. Other tables are merged key by key. Without a name of
+    a preset, the file's entry "preset" counts, or else `base`, which is DEFAULT_PRESET for None.
+    Raises UsageError if there is no such preset, or ModelError if a setting is unknown or its value
+    is not allowed. The message names the file it is in.
     """
     given = read_config_file(file) if file else {}
     named = given.pop("preset", DEFAULT_PRESET if base is None else None)
@@ -277,7 +313,10 @@ def configure(
     def absolute(path: str) -> str:  # so that a run can continue from another working folder
         return str(expanded(path).absolute())
 
-    sources = {name if name == GENERATOR else absolute(name): weight for name, weight in config.sources.items()}
+    sources = {
+        name if name == GENERATOR else absolute(name): weight
+        for name, weight in config.sources.items()
+    }
     start_from = config.start_from
     if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
         start_from = absolute(start_from)
@@ -285,9 +324,12 @@ def configure(
 
 
 def check_resumable(started: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
-    """Raise ModelError, with the path of the checkpoint, for a setting that differs and is not in CHANGEABLE."""
+    """Raise ModelError, with the path of the checkpoint, for a setting that differs and is not in
+    CHANGEABLE.
+    """
     old, new = _flat(started.to_dict()), _flat(asked.to_dict())
-    # In the order of the configuration, where the most important settings, such as the network's size, come first.
+    # In the order of the configuration, where the most important settings, such as the network's
+    # size, come first.
     for name in [*new, *(name for name in old if name not in new)]:
         if name not in CHANGEABLE and old.get(name) != new.get(name):
             raise ModelError(
@@ -309,5 +351,9 @@ def _merge(values: Settings, changes: Settings) -> Settings:
 def _flat(values: Settings, prefix: str = "") -> Settings:
     flat: Settings = {}
     for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= (
+            _flat(value, f"{prefix}{key}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{key}": value}
+        )
     return flat

@@ -1,8 +1,10 @@
-"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run.
+"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the
+run.
 
-A run starts or continues in a folder, with one process or with all processes of torchrun. After each backward pass the
-processes average their gradients in one message, with gloo on CPUs and NCCL on GPUs. Every process then computes the
-same update of the same weights. The only other data exchanged is the training time of the first process.
+A run starts or continues in a folder, with one process or with all processes of torchrun. After
+each backward pass the processes average their gradients in one message, with gloo on CPUs and NCCL
+on GPUs. Every process then computes the same update of the same weights. The only other data
+exchanged is the training time of the first process.
 """
 
 import copy
@@ -45,7 +47,9 @@ from splinecli.workshop.training.tasks import DROPOUT_STREAM, PixelTask, Refinem
 
 @dataclass(frozen=True)
 class Workers:
-    """The rank of this process among `count` processes. Rank 0 leads: only it writes files and keeps the time."""
+    """The rank of this process among `count` processes. Rank 0 leads: only it writes files and
+    keeps the time.
+    """
 
     rank: int = 0
     count: int = 1
@@ -56,20 +60,29 @@ class Workers:
         return self.rank == 0
 
     def shards(self, total: int) -> range:
-        """Return the shards of a batch for this process. Raises UsageError if they cannot be shared evenly."""
+        """Return the shards of a batch for this process. Raises UsageError if they cannot be shared
+        evenly.
+        """
         if total % self.count:
             raise UsageError(
                 f"{self.count} processes cannot share the {total} shards of a batch evenly",
-                hint=f"Add --param shards={self.count}, or start a number of processes that divides {total}",
+                hint=(
+                    f"Add --param shards={self.count}, or start a number of processes that divides"
+                    f" {total}"
+                ),
             )
         return range(self.rank, total, self.count)
 
     def average(self, parameters: Iterable[nn.Parameter], numbers: Tensor) -> Tensor:
-        """Average the gradients over all processes, in place, and return the average of `numbers` (N,)."""
+        """Average the gradients over all processes, in place, and return the average of `numbers`
+        (N,).
+        """
         if self.count == 1:
             return numbers
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        message = torch.cat([*(gradient.flatten() for gradient in gradients), numbers.to(gradients[0])])
+        message = torch.cat(
+            [*(gradient.flatten() for gradient in gradients), numbers.to(gradients[0])]
+        )
         with _lost_peers_as_model_errors():
             dist.all_reduce(message)
         message /= self.count
@@ -105,13 +118,16 @@ def _lost_peers_as_model_errors() -> Iterator[None]:
 def restarts_are_allowed() -> bool:
     """Return whether torchrun restarts the processes when one fails. They then continue the run.
 
-    There is no way to know whether this has just happened: torchrun does not report failures on other machines.
+    There is no way to know whether this has just happened: torchrun does not report failures on
+    other machines.
     """
     return int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
-    """Join the other processes, if torchrun started any; return the rank of this process and its device."""
+    """Join the other processes, if torchrun started any; return the rank of this process and its
+    device.
+    """
     if "TORCHELASTIC_RUN_ID" not in os.environ and int(os.environ.get("WORLD_SIZE", "1")) <= 1:
         return Workers(), device
     if device.type == "cuda":
@@ -121,8 +137,9 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
         backend = "nccl" if device.type == "cuda" else "gloo"
         attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
         if attempt and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
-            # torchrun keeps its store after a restart, with the addresses of processes that have ended. Prefixing the
-            # keys with the attempt number hides these. All processes agree on the number only on a single machine.
+            # torchrun keeps its store after a restart, with the addresses of processes that have
+            # ended. Prefixing the keys with the attempt number hides these. All processes agree on
+            # the number only on a single machine.
             store, rank, count = next(rendezvous("env://"))
             store = PrefixStore(f"splinecli attempt {attempt}", store)
             dist.init_process_group(backend, store=store, rank=rank, world_size=count)
@@ -142,11 +159,17 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
     rise = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
     if config.schedule == "stepped":
         return config.learning_rate * rise * (0.1 if progress >= 0.9 else 1.0)
-    return config.learning_rate * rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+    return (
+        config.learning_rate
+        * rise
+        * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+    )
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network, which may have an error head, refinement nets or context that they lack."""
+    """Copy the weights into the network, which may have an error head, refinement nets or context
+    that they lack.
+    """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:
@@ -155,11 +178,15 @@ def _start_from(weights: str, network: SplineNet) -> None:
             problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
             raise ModelError(
                 f"the weights {weights!r} are of a network {problem}",
-                hint="Choose the preset, or the settings network.*, that the weights were trained with",
+                hint=(
+                    "Choose the preset, or the settings network.*, that the weights were trained"
+                    " with"
+                ),
             )
     if wanted["refines_twice"] and not found["refines"]:
         raise ModelError(
-            f"the weights {weights!r} have no refinement net, and the run would train the second one",
+            f"the weights {weights!r} have no refinement net, and the run would train the second"
+            " one",
             hint="Train the first one with --param network.refines_twice=false",
         )
     network.load_state_dict(loaded.state_dict(), strict=False)
@@ -182,7 +209,9 @@ class Trainer:
         tensorboard: bool = False,
         observer: Observer = SILENT,
     ) -> None:
-        """Start a run, or resume one; see open_run. Raises ModelError, OutputError, InputError, UsageError."""
+        """Start a run, or resume one; see open_run. Raises ModelError, OutputError, InputError,
+        UsageError.
+        """
         self.config = config
         self.folder = folder
         self.device = device
@@ -190,7 +219,9 @@ class Trainer:
         self.shards = self.workers.shards(config.shards)
         if not resume and (folder / CHECKPOINT).exists():
             raise OutputError(
-                "already contains a run", path=folder, hint="Continue it with --resume, or choose another -o"
+                "already contains a run",
+                path=folder,
+                hint="Continue it with --resume, or choose another -o",
             )
         task = RefinementTask if config.updates == "refine_net" else PixelTask
         self.task: PixelTask | RefinementTask = task(config, self.shards, device)
@@ -207,11 +238,15 @@ class Trainer:
             weight_decay=config.weight_decay,
         )
         # Emulated bfloat16 is slower than float32.
-        self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
+        self.bfloat16 = (
+            config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
+        )
         self.counters = RunCounters()
         if resume:
             state = self.network, self.average, self.optimizer
-            self.counters = run_files.load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
+            self.counters = run_files.load_checkpoint(
+                folder / CHECKPOINT, *state, self.task.sets.sha256
+            )
         if self.workers.leads and self.task.long_start:
             observer.say(self.task.long_start)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
@@ -227,10 +262,12 @@ class Trainer:
         return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
-        """Train to the end, saving regularly, and return the last metrics on the leader. A finished run is left alone.
+        """Train to the end, saving regularly, and return the last metrics on the leader. A finished
+        run is left alone.
 
-        `report` is called with progress and metrics at each entry of the log. Raises ModelError if the loss or its
-        gradient is no longer finite; the last checkpoint stays. Raises OutputError if a file cannot be written.
+        `report` is called with progress and metrics at each entry of the log. Raises ModelError if
+        the loss or its gradient is no longer finite; the last checkpoint stays. Raises OutputError
+        if a file cannot be written.
         """
         metrics = None
         losses: dict[Part, list[Tensor]] = {}
@@ -262,12 +299,17 @@ class Trainer:
         return metrics
 
     def step(self) -> Tensor:
-        """Update once on a new batch; return the losses (6,), as in Losses, averaged over all processes."""
+        """Update once on a new batch; return the losses (6,), as in Losses, averaged over all
+        processes.
+        """
         config = self.config
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, self.counters.step, self.progress)
-        # Dropout draws from the global generator. It is seeded by the step, so a resumed run drops the same channels.
-        torch.manual_seed(stream_seed(config.seed, self.counters.step, DROPOUT_STREAM + self.workers.rank))
+        # Dropout draws from the global generator. It is seeded by the step, so a resumed run drops
+        # the same channels.
+        torch.manual_seed(
+            stream_seed(config.seed, self.counters.step, DROPOUT_STREAM + self.workers.rank)
+        )
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         total = torch.zeros(len(Losses._fields), dtype=torch.float64, device=self.device)
@@ -275,15 +317,20 @@ class Trainer:
             torch.autograd.backward(losses.total / len(self.shards))
             total += torch.stack([loss.detach().double() for loss in losses]) / len(self.shards)
         numbers = self.workers.average(self.network.parameters(), total).cpu()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit or math.inf)
+        norm = torch.nn.utils.clip_grad_norm_(
+            self.network.parameters(), config.gradient_limit or math.inf
+        )
         for name, value in (("loss", numbers[0]), ("gradient", norm)):
             if not torch.isfinite(value):
                 raise self._not_finite(f"the {name} is {value.item()}")
         self.optimizer.step()
-        # Increase the decay with the steps; otherwise the average would depend on the initial weights for too long.
+        # Increase the decay with the steps; otherwise the average would depend on the initial
+        # weights for too long.
         decay = min(config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
         with torch.no_grad():
-            for averaged, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            for averaged, current in zip(
+                self.average.parameters(), self.network.parameters(), strict=True
+            ):
                 averaged.lerp_(current, 1 - decay)
         self.counters.step += 1
         self.counters.pixels += config.batch_size
@@ -292,12 +339,15 @@ class Trainer:
     def save(self) -> None:
         """Write averaged weights, pictures and checkpoint. Raises OutputError.
 
-        The checkpoint comes last: a run killed before that point repeats the steps and rewrites the other files.
+        The checkpoint comes last: a run killed before that point repeats the steps and rewrites the
+        other files.
         """
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
         state = self.network, self.average, self.optimizer, self.counters
-        run_files.save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
+        run_files.save_checkpoint(
+            self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256
+        )
 
     def _not_finite(self, problem: str) -> ModelError:
         lower = "a lower learning rate, such as --param learning_rate=1e-4"
@@ -307,10 +357,14 @@ class Trainer:
         return ModelError(f"{problem} at step {self.counters.step}", path=self.folder, hint=hint)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
-        """Return the metrics from means (N, 6) over the steps of each part: both together, or NE-Net and LI-Net."""
+        """Return the metrics from means (N, 6) over the steps of each part: both together, or
+        NE-Net and LI-Net.
+        """
         # Each network has its own loss, so losses are added. Errors are averaged.
         summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
-        checked_deg = self.task.validation_deg(self.average, bfloat16=self.bfloat16) if check else None
+        checked_deg = (
+            self.task.validation_deg(self.average, bfloat16=self.bfloat16) if check else None
+        )
         return Metrics(
             step=self.counters.step,
             pixels=self.counters.pixels,
@@ -327,12 +381,18 @@ class Trainer:
 
 
 def configure_run(
-    folder: Path, preset_name: str | None, file: Path | None, changes: Sequence[Settings], *, resume: bool
+    folder: Path,
+    preset_name: str | None,
+    file: Path | None,
+    changes: Sequence[Settings],
+    *,
+    resume: bool,
 ) -> tuple[TrainingConfig, bool]:
     """Return the configuration of a run, and whether it continues. Raises ModelError, UsageError.
 
-    A run continues on request, or after torchrun has restarted its processes: with --max-restarts, one command both
-    starts a run and continues it. Without a preset, settings that are not given keep the values of the continued run.
+    A run continues on request, or after torchrun has restarted its processes: with --max-restarts,
+    one command both starts a run and continues it. Without a preset, settings that are not given
+    keep the values of the continued run.
     """
     if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
         return configure(preset_name, file, changes), False
@@ -352,13 +412,15 @@ def open_run(
     tensorboard: bool,
     observer: Observer,
 ) -> Iterator[Trainer]:
-    """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
+    """Join the other processes, lock the folder and yield the trainer of a run that `configure_run`
+    has configured.
 
     The observer receives messages about files left by a killed process and about a slow start.
 
-    Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
-    installed; ModelError if the checkpoint does not fit, or the initial weights cannot be used; InputError if a pixel
-    set cannot be used; OutputError if the folder cannot be written, or has a run in it and `resume` is not set.
+    Raises UsageError if the processes cannot share a batch, the device is not available, or
+    TensorBoard is not installed; ModelError if the checkpoint does not fit, or the initial weights
+    cannot be used; InputError if a pixel set cannot be used; OutputError if the folder cannot be
+    written, or has a run in it and `resume` is not set.
     """
     check_writable(folder)
     use_available_cores()
@@ -369,5 +431,11 @@ def open_run(
         if workers.leads:
             stack.enter_context(held_folder(folder, observer.warn))
         yield Trainer(
-            config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard, observer=observer
+            config,
+            folder,
+            device,
+            resume=resume,
+            workers=workers,
+            tensorboard=tensorboard,
+            observer=observer,
         )

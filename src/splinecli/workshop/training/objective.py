@@ -1,7 +1,9 @@
-"""The losses of SPLINE-Net (Zheng et al., ICCV 2019, section 3), for both networks or for one while the other is fixed.
+"""The losses of SPLINE-Net (Zheng et al., ICCV 2019, section 3), for both networks or for one while
+the other is fixed.
 
-Every loss is the mean of one number per pixel. The loss of a batch is therefore the mean of the losses of its equal
-parts. The paper does not specify whether |.| is a sum or an average over the cells of a map; the argument `norm` does.
+Every loss is the mean of one number per pixel. The loss of a batch is therefore the mean of the
+losses of its equal parts. The paper does not specify whether |.| is a sum or an average over the
+cells of a map; the argument `norm` does.
 """
 
 import math
@@ -21,7 +23,8 @@ from splinecli.workshop.training.config import Norm, TrainingConfig
 
 Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
-# Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth.
+# Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of
+# its azimuth.
 AXIS_LENGTH = 0.01
 
 
@@ -59,23 +62,34 @@ def compute_losses(
 ) -> Losses:
     """Compute the losses of a batch (eqs. 5 and 8 of the paper; docs/train.md lists the terms).
 
-    LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt); NE-Net:
-    arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks are updated, the losses are added
-    and the angle is included only once. If pixels share captures, the angle is divided by the square root of the
-    capture's error. The loss of the error head is the negative log-likelihood of the angle.
+    LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a
+    La(D, n_gt); NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both
+    networks are updated, the losses are added and the angle is included only once. If pixels share
+    captures, the angle is divided by the square root of the capture's error. The loss of the error
+    head is the negative log-likelihood of the angle.
     """
-    maps = network.build_maps(batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored))
+    maps = network.build_maps(
+        batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored)
+    )
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
-    autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+    autocast = torch.autocast(
+        batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16
+    )
     if part == "error_head":
         with fixed(network, part), autocast:
-            normals, error = network.estimate(maps, network.interpolate(maps), captures=batch.captures)
+            normals, error = network.estimate(
+                maps, network.interpolate(maps), captures=batch.captures
+            )
         assert error is not None, "TrainingConfig asks for an error head"
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
-        return Losses(error_negative_log_likelihood(error, angle).mean(), angle.mean(), *[missing] * 4)
+        return Losses(
+            error_negative_log_likelihood(error, angle).mean(), angle.mean(), *[missing] * 4
+        )
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
     # The maps take half of the time of a batch, and CNN-PS does not use them.
-    dense_truth = dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
+    dense_truth = (
+        dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
+    )
     with fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
             dense = network.interpolate(maps)
@@ -91,7 +105,9 @@ def compute_losses(
     if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
         symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
     shared = batch.captures < len(of_pixels)
-    total = config.angle_weight * (balanced(of_pixels.view(-1, batch.captures).mean(dim=0)) if shared else angle)
+    total = config.angle_weight * (
+        balanced(of_pixels.view(-1, batch.captures).mean(dim=0)) if shared else angle
+    )
     if part != "ne_net" and dense is not None and dense_truth is not None:
         for weight, cells in ((config.map_weight, 1), (config.masked_weight, maps.occupied)):
             known = dense_truth.known * cells
@@ -122,22 +138,29 @@ def _special(
         fine, coarse = asymmetries(maps, axes, dense_truth.filled)
         share = 1 / cells if norm == "mean" else 1
         symmetric = symmetric + share * fine.mean()
-        asymmetric = asymmetric + share * asymmetric_loss(fine, coarse, eta=config.eta, lambda_c=config.lambda_c)
+        asymmetric = asymmetric + share * asymmetric_loss(
+            fine, coarse, eta=config.eta, lambda_c=config.lambda_c
+        )
     return symmetric, asymmetric
 
 
 def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> DenseMap:
-    """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut off."""
+    """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut
+    off.
+    """
     dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
     cells = values, dense.known, dense.filled
-    # The cells are arranged symmetrically, so reversing the rows gives the maps of the mirrored pixels.
+    # The cells are arranged symmetrically, so reversing the rows gives the maps of the mirrored
+    # pixels.
     return DenseMap(*(each.flip(2) for each in cells) if maps.mirrored else cells)
 
 
 @contextmanager
 def fixed(network: SplineNet, part: Part) -> Iterator[None]:
-    """Compute no gradients for parameters outside `part`. Gradients still propagate through them."""
+    """Compute no gradients for parameters outside `part`. Gradients still propagate through
+    them.
+    """
     inside = {
         "both": ("",),
         "ne_net": ("ne_net.", "set_branch."),
@@ -162,17 +185,19 @@ def fixed(network: SplineNet, part: Part) -> Iterator[None]:
 def angles(normals: Tensor, truth: Tensor) -> Tensor:
     """Return arccos(n . n_gt) in radians, (P,); normals and truth are (P, 3), unit.
 
-    Computed as atan2(|n x n_gt|, n . n_gt), because the gradient of arccos is infinite at an angle of 0.
+    Computed as atan2(|n x n_gt|, n . n_gt), because the gradient of arccos is infinite at an angle
+    of 0.
     """
     sine = torch.linalg.cross(normals, truth).square().sum(-1).add(1e-12).sqrt()
     return torch.atan2(sine, (normals * truth).sum(-1))
 
 
 def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
-    """Return the mean error of captures (G,) in radians, each divided by the square root of its reference.
+    """Return the mean error of captures (G,) in radians, each divided by the square root of its
+    reference.
 
-    An error of one degree thus has more weight in a capture that is already accurate. The reference (G,), by default
-    `error`, measures the difficulty of each capture.
+    An error of one degree thus has more weight in a capture that is already accurate. The reference
+    (G,), by default `error`, measures the difficulty of each capture.
     """
     reference = error.detach() if reference is None else reference
     # Without this offset, captures that are already accurate would have too much weight.
@@ -181,21 +206,24 @@ def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |D - D_gt| over the given cells, or |M_s o (D - D_gt)| over cells of the sparse map: average or sum.
+    """Return |D - D_gt| over the given cells, or |M_s o (D - D_gt)| over cells of the sparse map:
+    average or sum.
 
-    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells to include, whose true value must
-    be known, else 0.
+    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells to include,
+    whose true value must be known, else 0.
     """
     total = ((dense - truth).abs() * cells).sum((1, 2, 3))
     return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:
-    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and projected unit normals (P, 3).
+    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and projected
+    unit normals (P, 3).
 
-    The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are interpolated,
-    so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has no
-    azimuth. Its map is rotated by 180 degrees, which is also a symmetry.
+    The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells
+    are interpolated, so that the result has a gradient with respect to the normal as well as the
+    map. A normal towards the camera has no azimuth. Its map is rotated by 180 degrees, which is
+    also a symmetry.
     """
     size = maps.shape[-1]
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
@@ -210,12 +238,13 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
 
 
 def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
-    """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and (P,).
+    """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and
+    (P,).
 
-    The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with stride 2. Maps D and
-    `filled`, 1 in cells with a value, else 0, are (P, 1, w, w); normals are (P, 3), unit. Only filled cells with a
-    filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be partly interpolated
-    from empty cells.
+    The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with
+    stride 2. Maps D and `filled`, 1 in cells with a value, else 0, are (P, 1, w, w); normals are
+    (P, 3), unit. Only filled cells with a filled mirror image are compared. Near the rim and beside
+    gaps, a mirrored value would be partly interpolated from empty cells.
     """
     image, image_filled = torch.chunk(mirror(torch.cat((dense, filled), dim=1), normals), 2, dim=1)
     both = filled * (image_filled > 0.999)
@@ -228,7 +257,7 @@ def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor,
 def asymmetric_loss(fine: Tensor, coarse: Tensor, *, eta: float, lambda_c: float) -> Tensor:
     """Return La = ||D - r(D, n)| - eta| + lambda_c ||p(D) - p(r(D, n))| - eta|.
 
-    Shadows and interreflections make a map slightly asymmetric, in connected regions. eta is the expected asymmetry,
-    summed over cells. `fine` and `coarse` are the results of `asymmetries`.
+    Shadows and interreflections make a map slightly asymmetric, in connected regions. eta is the
+    expected asymmetry, summed over cells. `fine` and `coarse` are the results of `asymmetries`.
     """
     return ((fine - eta).abs() + lambda_c * (coarse - eta).abs()).mean()

@@ -1,4 +1,6 @@
-"""Training of the refinement net on images of rendered scenes, after a SPLINE-Net with fixed weights."""
+"""Training of the refinement net on images of rendered scenes, after a SPLINE-Net with fixed
+weights.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +20,39 @@ from splinecli.estimate.networks.li_ne_net import error_negative_log_likelihood
 from splinecli.estimate.networks.refine_net import channels, split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork
-from splinecli.estimate.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
+from splinecli.estimate.refinement.features import (
+    Turn,
+    brightness,
+    refine_features,
+    turn_features,
+    turn_maps,
+)
 from splinecli.images.lens_blur import REACH
 from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting, parts_of_pixels
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
-from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
-from splinecli.workshop.synthesis.whole_capture import add_background, draw_engraved, photograph_scene, scatter
+from splinecli.workshop.synthesis.lights import (
+    choose_in_cone,
+    draw_light_counts,
+    draw_light_directions,
+)
+from splinecli.workshop.synthesis.whole_capture import (
+    add_background,
+    draw_engraved,
+    photograph_scene,
+    scatter,
+)
 from splinecli.workshop.training.objective import angles, balanced
 
-# Captures simulated before the first step. With 64, the net memorised them and was worse on others for half an hour.
+# Captures simulated before the first step. With 64, the net memorised them and was worse on others
+# for half an hour.
 FIRST_EXAMPLES = 160
-STEPS_PER_EXAMPLE = 6  # after which another capture is simulated: about half of the training time on a CPU
+# after which another capture is simulated: about half of the training time on a CPU
+STEPS_PER_EXAMPLE = 6
 MOST_EXAMPLES = 2000  # of about a megabyte each; later ones replace the oldest
-# Shares of the scene captures that are enlarged, and of all captures with a background and of engraved pieces.
+# Shares of the scene captures that are enlarged, and of all captures with a background and of
+# engraved pieces.
 _ENLARGED_SHARE, _BACKGROUND_SHARE, _ENGRAVED_SHARE = 0.3, 0.35, 0.4
 
 
@@ -59,9 +79,10 @@ class Scene(NamedTuple):
 class ScenePool:
     """Captures of scenes, each with its own lights and faults. The pool grows during training.
 
-    A capture depends only on (seed, its number). The scenes are pixel sets with some of their entries, and the weight
-    of each set; the network has an error head and is on the device of the captures. A resumed run begins with its
-    newest captures, of which `first` is the number of the first.
+    A capture depends only on (seed, its number). The scenes are pixel sets with some of their
+    entries, and the weight of each set; the network has an error head and is on the device of the
+    captures. A resumed run begins with its newest captures, of which `first` is the number of the
+    first.
     """
 
     def __init__(
@@ -86,11 +107,15 @@ class ScenePool:
         self.examples.append(self._after_network(*self.draw_scene(generator), generator))
         self._made += 1
 
-    def draw_scene(self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE) -> Scene:
+    def draw_scene(
+        self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE
+    ) -> Scene:
         """Draw a part of a scene, or an engraved piece, and the lights of its capture."""
         config = self.config
         if float(torch.rand((), generator=generator)) < engraved_share:
-            count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
+            count = draw_light_counts(
+                1, config.min_lights, config.max_lights, config.usual_lights, generator
+            )
             lights = draw_light_directions(1, int(count), generator)[0]
             truth, radiance, mask = draw_engraved(80, lights, generator)
             return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
@@ -100,7 +125,9 @@ class ScenePool:
         pixels = pixel_set.load(entry)
         lights = torch.from_numpy(np.array(pixels.light_directions))
         most = min(config.max_lights, entry.n_lights)
-        counts = draw_light_counts(1, config.min_lights, most, min(config.usual_lights, most), generator)
+        counts = draw_light_counts(
+            1, config.min_lights, most, min(config.usual_lights, most), generator
+        )
         chosen = choose_in_cone(lights, int(counts), generator)
         mask = torch.from_numpy(np.array(pixels.mask))
         scale = 1 + 2.0 * float(torch.rand((), generator=generator))
@@ -108,34 +135,46 @@ class ScenePool:
         # A part of the map around a random pixel of the object.
         places, side = mask.nonzero(), round(96 / scale)
         middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
-        bounds = zip(middle, places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist(), strict=True)
+        bounds = zip(
+            middle, places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist(), strict=True
+        )
         starts = [(max(low, min(at - side // 2, high - side)), high) for at, low, high in bounds]
         box = tuple(slice(start, min(start + side, high)) for start, high in starts)
         kept = torch.zeros_like(mask)
         kept[box] = mask[box]
         rows = kept[mask].numpy()
-        values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
+        values = np.hstack(
+            [pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]
+        ).astype(np.float32)
         maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
         scatters = torch.rand((), generator=generator) < 0.2 * config.optics_share
         if scatters and "-diffuse" in entry.name:
             maps[:-3] = scatter(maps[:-3], mask, generator)
         return Scene(maps, lights[chosen], mask)
 
-    def _after_network(self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator) -> SceneMaps:
-        """Photograph maps (F + 3, H, W) of radiance and true normals, and return SPLINE-Net's estimates."""
+    def _after_network(
+        self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator
+    ) -> SceneMaps:
+        """Photograph maps (F + 3, H, W) of radiance and true normals, and return SPLINE-Net's
+        estimates.
+        """
         if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
         else:  # a dark margin, which a lens and its inverse filter mix with the outline
             maps, mask = pad(maps * mask, (REACH,) * 4), pad(mask, (REACH,) * 4)
         truth = torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-        observations, lights, _ = photograph_scene(maps[:-3].flatten(1).T, lights, self.config, generator, mask)
+        observations, lights, _ = photograph_scene(
+            maps[:-3].flatten(1).T, lights, self.config, generator, mask
+        )
         features = pixel_features(self.network, observations, lights, mask)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, rotate and mirror each, and stack them as float32 (count, ...)."""
         drawn = []
-        for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device):
+        for index in torch.randint(
+            len(self.examples), (count,), generator=generator, device=generator.device
+        ):
             example = self.examples[int(index)]
             draw = torch.rand(3, generator=generator, device=generator.device).tolist()
             turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
@@ -155,10 +194,11 @@ def _placed(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation between pixels of the mask.
+    """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation between pixels of
+    the mask.
 
-    A scene is rendered at low resolution, so its normals change considerably between adjacent pixels. A photograph of a
-    real object has more pixels, and adjacent normals are more similar.
+    A scene is rendered at low resolution, so its normals change considerably between adjacent
+    pixels. A photograph of a real object has more pixels, and adjacent normals are more similar.
     """
     if scale == 1:
         return maps, mask
@@ -168,7 +208,9 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
 
 
 @torch.no_grad()
-def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor) -> Tensor:
+def pixel_features(
+    network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor
+) -> Tensor:
     """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W).
 
     They are the same as at inference in float32.
@@ -182,7 +224,9 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
         own = observations.numpy()[rows]
         return PixelLighting(own if indirect is None else indirect.remove(own, rows), directions)
 
-    estimated, errors, lighting_at = estimate_pixels(mask.numpy(), observations.numpy(), lighting_without, estimator)
+    estimated, errors, lighting_at = estimate_pixels(
+        mask.numpy(), observations.numpy(), lighting_without, estimator
+    )
     assert errors is not None, "TrainingConfig asks for an error head"
     lights = light_directions.to(estimator.device)
     signs, reference = alternating_signs(lights), brightness(observations)
@@ -200,14 +244,21 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
     height, width = (max(capture.mask.shape[axis] for capture in captures) for axis in (-2, -1))
     return SceneMaps(
         *(
-            torch.stack([pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2])) for maps in field])
+            torch.stack(
+                [
+                    pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2]))
+                    for maps in field
+                ]
+            )
             for field in zip(*captures, strict=True)
         )
     )
 
 
 class RefinementLosses(NamedTuple):
-    """The total loss, and the mean angle in radians before and after refinement, averaged over captures."""
+    """The total loss, and the mean angle in radians before and after refinement, averaged over
+    captures.
+    """
 
     total: Tensor
     before: Tensor
@@ -219,11 +270,12 @@ def refinement_losses(
 ) -> RefinementLosses:
     """Compute the losses of stacked captures.
 
-    The error of each capture is its mean angle, plus `detail_weight` times the mean error of the differences between
-    neighbours. Wrong lights rotate all normals of a surface alike. This masks the sharpness of the detail in the
-    angles, but not in these differences. The error is divided by the square root of the capture's mean angle before
-    refinement, so a degree has more weight in a capture that is already accurate. The likelihood of the errors is the
-    same as for the error head.
+    The error of each capture is its mean angle, plus `detail_weight` times the mean error of the
+    differences between neighbours. Wrong lights rotate all normals of a surface alike. This masks
+    the sharpness of the detail in the angles, but not in these differences. The error is divided by
+    the square root of the capture's mean angle before refinement, so a degree has more weight in a
+    capture that is already accurate. The likelihood of the errors is the same as for the error
+    head.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -240,10 +292,14 @@ def refinement_losses(
         before = mean_over_capture(angles_of(split_features(maps.features)[0]))
     angle = angles_of(normals)
     after = mean_over_capture(angle)
-    surprise = mean_over_capture(error_negative_log_likelihood(error.movedim(1, -1), angle.detach()))
+    surprise = mean_over_capture(
+        error_negative_log_likelihood(error.movedim(1, -1), angle.detach())
+    )
     detail = torch.zeros_like(after)
     for axis in (1, 2):
-        both = known.narrow(axis, 1, known.shape[axis] - 1) & known.narrow(axis, 0, known.shape[axis] - 1)
+        both = known.narrow(axis, 1, known.shape[axis] - 1) & known.narrow(
+            axis, 0, known.shape[axis] - 1
+        )
         off = (normals - maps.normals).diff(dim=axis + 1).square().sum(dim=1).add(1e-8).sqrt()
         detail = detail + mean_over_capture(off, both) / 2
     total = balanced(after + detail_weight * detail, before) + 0.05 * surprise.mean()

@@ -1,8 +1,10 @@
-"""The files of a run: its log (metrics.csv, curves.png, maps.png, TensorBoard's event files) and its checkpoints.
+"""The files of a run: its log (metrics.csv, curves.png, maps.png, TensorBoard's event files) and
+its checkpoints.
 
-A checkpoint is one safetensors file from which a run continues where it stopped. It contains no random generator state,
-because the draws of a step depend only on the seed and the step number. A resumed run of the refinement net simulates
-its newest captures again and continues without the earlier ones.
+A checkpoint is one safetensors file from which a run continues where it stopped. It contains no
+random generator state, because the draws of a step depend only on the seed and the step number. A
+resumed run of the refinement net simulates its newest captures again and continues without the
+earlier ones.
 """
 
 import csv
@@ -37,13 +39,17 @@ from splinecli.workshop.training.tasks import SampleMaps
 
 @dataclass(frozen=True)
 class Metrics:
-    """One line of metrics.csv: means over the steps since the previous line. A value that was not computed is None."""
+    """One line of metrics.csv: means over the steps since the previous line. A value that was not
+    computed is None.
+    """
 
     step: int  # number of updates so far
     pixels: int  # number of training pixels drawn so far
     minutes: float  # training time so far
     learning_rate: float  # the rate of the last update
-    loss: float  # the weighted sum of all terms. If LI-Net and NE-Net are updated in turn, the sum of both losses.
+    # the weighted sum of all terms. If LI-Net and NE-Net are updated in turn, the sum of both
+    # losses.
+    loss: float
     angle_deg: float  # mean angular error of the training pixels, in degrees
     map_error: float | None  # mean absolute error of LI-Net's dense map. None without a LI-Net.
     masked_map_error: float | None  # the same over the cells of the sparse map
@@ -58,7 +64,9 @@ _HEADER = ",".join(field.name for field in fields(Metrics))
 
 
 class RunLog:
-    """Writer of the log files in `folder`. Its methods raise OutputError if a file cannot be written."""
+    """Writer of the log files in `folder`. Its methods raise OutputError if a file cannot be
+    written.
+    """
 
     def __init__(self, folder: Path, step: int, *, tensorboard: bool = False) -> None:
         """Open the log at a step and drop the lines of later steps, which the run will repeat.
@@ -83,7 +91,9 @@ class RunLog:
                 writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
                 if is_new:
                     writer.writeheader()
-                writer.writerow({key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()})
+                writer.writerow(
+                    {key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()}
+                )
         except OSError as error:
             raise OutputError(f"cannot be written ({error.strerror})", path=path) from error
         if self._events is not None:
@@ -96,12 +106,18 @@ class RunLog:
     def draw(self, maps: SampleMaps | None) -> None:
         """Update curves.png, and maps.png if maps are given."""
         rows = read_metrics(self.folder / METRICS)
-        columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
+        columns = {
+            field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)
+        }
         write_bytes(self.folder / CURVES, png_bytes(training_figure(columns), dpi=110))
         if maps is None:
             return
         figure = observation_map_figure(
-            maps.sparse, maps.dense, maps.truth, error_deg=maps.error_deg, truth_label="true map, gaps filled"
+            maps.sparse,
+            maps.dense,
+            maps.truth,
+            error_deg=maps.error_deg,
+            truth_label="true map, gaps filled",
         )
         write_bytes(self.folder / TRAINING_MAPS, figure)
 
@@ -145,7 +161,9 @@ def _drop_lines_after(step: int, path: Path) -> Path | None:
 
 
 def _lines_until(step: int, path: Path) -> list[str]:
-    """Return the lines up to a step, without the last one if a full disk has cut it. Raises ValueError."""
+    """Return the lines up to a step, without the last one if a full disk has cut it. Raises
+    ValueError.
+    """
     if not path.exists():
         return []
     if not path.is_file() or path.stat().st_size > 1 << 26:  # about half a million lines
@@ -184,7 +202,8 @@ def save_checkpoint(
     counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the complete state of a run, with the running average of the weights and the SHA-256 of each pixel set.
+    """Write the complete state of a run, with the running average of the weights and the SHA-256 of
+    each pixel set.
 
     Raises OutputError.
     """
@@ -194,7 +213,10 @@ def save_checkpoint(
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
     contiguous = torch.contiguous_format
-    plain = {name: tensor.detach().cpu().clone(memory_format=contiguous) for name, tensor in tensors.items()}
+    plain = {
+        name: tensor.detach().cpu().clone(memory_format=contiguous)
+        for name, tensor in tensors.items()
+    }
     metadata = {
         "format": FORMAT,
         "config": json.dumps(config.to_dict()),
@@ -212,11 +234,17 @@ def read_checkpoint_config(path: Path) -> TrainingConfig:
 
 
 def load_checkpoint(
-    path: Path, network: SplineNet, average: SplineNet, optimizer: torch.optim.Optimizer, sets: dict[str, str]
+    path: Path,
+    network: SplineNet,
+    average: SplineNet,
+    optimizer: torch.optim.Optimizer,
+    sets: dict[str, str],
 ) -> RunCounters:
-    """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
+    """Restore networks and optimiser from a checkpoint, in place, and return the counters of the
+    run.
 
-    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has changed.
+    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has
+    changed.
     """
     tensors, metadata = _read(path)
     for name, sha256 in read_json_entry(metadata, "sets", path, dict[str, str]).items():
@@ -233,7 +261,9 @@ def load_checkpoint(
         for name, tensor in _under("optimizer.", tensors).items():
             index, _, key = name.partition(".")
             states.setdefault(int(index), {})[key] = tensor
-        optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+        optimizer.load_state_dict(
+            {"state": states, "param_groups": optimizer.state_dict()["param_groups"]}
+        )
     except (TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
     counters: RunCounters = read_json_entry(metadata, "clock", path, RunCounters)
@@ -241,7 +271,11 @@ def load_checkpoint(
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(prefix)
+    }
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

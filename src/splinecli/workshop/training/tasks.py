@@ -1,4 +1,5 @@
-"""Training data of a run: pixels for LI-Net, NE-Net and the error head, or whole scenes for the refinement net.
+"""Training data of a run: pixels for LI-Net, NE-Net and the error head, or whole scenes for the
+refinement net.
 
 Pixels come from the pixel generator, from pixel sets, or from a mixture.
 """
@@ -42,10 +43,15 @@ from splinecli.workshop.training.refinement import (
 
 
 class MixedSource:
-    """Draws each batch from one of several sources, with probabilities proportional to their weights."""
+    """Draws each batch from one of several sources, with probabilities proportional to their
+    weights.
+    """
 
     def __init__(
-        self, sources: Sequence[PixelGenerator | PixelSetSource], weights: Sequence[float], generator: torch.Generator
+        self,
+        sources: Sequence[PixelGenerator | PixelSetSource],
+        weights: Sequence[float],
+        generator: torch.Generator,
     ) -> None:
         self.sources = tuple(sources)
         self.weights = torch.tensor(weights, dtype=torch.float64)
@@ -61,10 +67,14 @@ class MixedSource:
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
     """Split the entries of a set into training and validation entries, scene by scene.
 
-    The scenes whose names have the lowest hashes are used for validation, so the choice for one scene hardly depends on
-    the other scenes of the set. A share above 0 selects at least one scene, and always leaves one for training.
+    The scenes whose names have the lowest hashes are used for validation, so the choice for one
+    scene hardly depends on the other scenes of the set. A share above 0 selects at least one scene,
+    and always leaves one for training.
     """
-    scenes = sorted({entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest())
+    scenes = sorted(
+        {entry.scene for entry in entries},
+        key=lambda scene: hashlib.sha256(scene.encode()).digest(),
+    )
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
     validation = set(scenes[: min(count, len(scenes) - 1)])
     return (
@@ -74,14 +84,16 @@ def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], l
 
 
 PixelSource = PixelGenerator | PixelSetSource | MixedSource
-Scenes = dict[str, tuple[PixelSet, list[Entry]]]  # by path, each with its entries for training or for validation
+# by path, each with its entries for training or for validation
+Scenes = dict[str, tuple[PixelSet, list[Entry]]]
 
 
 @dataclass(frozen=True)
 class OpenSets:
     """The pixel sets of a run."""
 
-    # training, validation: the scenes for each purpose. A set with a single scene is validated on its training pixels.
+    # training, validation: the scenes for each purpose. A set with a single scene is validated on
+    # its training pixels.
     training: Scenes
     validation: Scenes
     single_scene_sets: tuple[str, ...]  # the paths of these sets
@@ -95,13 +107,16 @@ class OpenSets:
 def open_sets(config: TrainingConfig) -> OpenSets:
     """Open the pixel sets of a configuration.
 
-    Raises InputError if a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
-    training.
+    Raises InputError if a pixel set is missing, unfinished or does not match its manifest, or has
+    no scene left for training.
     """
     names = [name for name, weight in config.sources.items() if weight > 0 and name != GENERATOR]
     sets = {name: open_pixel_set(Path(name)) for name in names}
-    parts = {name: split_scenes(pixel_set.entries, config.held_share) for name, pixel_set in sets.items()}
-    # Two sets may contain the same shape. A shape that one of them uses for validation is not used for training.
+    parts = {
+        name: split_scenes(pixel_set.entries, config.held_share) for name, pixel_set in sets.items()
+    }
+    # Two sets may contain the same shape. A shape that one of them uses for validation is not used
+    # for training.
     shapes = {entry.sha256["normals"] for _, validation in parts.values() for entry in validation}
     for name, (training, validation) in parts.items():
         kept = [entry for entry in training if entry.sha256["normals"] not in shapes]
@@ -114,7 +129,10 @@ def open_sets(config: TrainingConfig) -> OpenSets:
         parts[name] = kept, validation
     return OpenSets(
         {name: (sets[name], training) for name, (training, _) in parts.items()},
-        {name: (sets[name], validation or training) for name, (training, validation) in parts.items()},
+        {
+            name: (sets[name], validation or training)
+            for name, (training, validation) in parts.items()
+        },
         tuple(name for name, (_, validation) in parts.items() if not validation),
     )
 
@@ -122,13 +140,17 @@ def open_sets(config: TrainingConfig) -> OpenSets:
 def pixel_source(
     config: TrainingConfig, scenes: Scenes, generator: torch.Generator, *, validates: bool = False
 ) -> PixelSource:
-    """Return the source of a configuration's pixels. Validation pixels all have `usual_lights` lights."""
+    """Return the source of a configuration's pixels. Validation pixels all have `usual_lights`
+    lights.
+    """
     pixels, usual = config.pixels, config.pixels.usual_lights
     if validates:
         pixels = replace(pixels, min_lights=usual, max_lights=usual)
     weights = {name: weight for name, weight in config.sources.items() if weight > 0}
     opened = [
-        PixelGenerator(pixels, generator) if name == GENERATOR else PixelSetSource(*scenes[name], pixels, generator)
+        PixelGenerator(pixels, generator)
+        if name == GENERATOR
+        else PixelSetSource(*scenes[name], pixels, generator)
         for name in weights
     ]
     return opened[0] if len(opened) == 1 else MixedSource(opened, list(weights.values()), generator)
@@ -138,9 +160,14 @@ VALIDATION_PIXELS = 2048
 VALIDATION_SCENES = 12
 SHOWN_PIXELS = 8
 
-# Random streams of a step. Its shards are numbered from 0. DROPOUT_STREAM is for process 0; the streams of the other
-# processes follow.
-_BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 - 1, 2**31 + 2
+# Random streams of a step. Its shards are numbered from 0. DROPOUT_STREAM is for process 0; the
+# streams of the other processes follow.
+_BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = (
+    2**31,
+    2**31 + 1,
+    2**31 - 1,
+    2**31 + 2,
+)
 
 
 class SampleMaps(NamedTuple):
@@ -153,7 +180,9 @@ class SampleMaps(NamedTuple):
 
 
 class PixelTask:
-    """Batches of pixels from the sources of a run: `source` for training, and the sources for `validation`."""
+    """Batches of pixels from the sources of a run: `source` for training, and the sources for
+    `validation`.
+    """
 
     long_start = ""  # message about the work of `prepare` if it takes minutes
 
@@ -169,7 +198,9 @@ class PixelTask:
         self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        """Draw the data of process `rank` for the first step of this run, `step`. Only process 0 validates."""
+        """Draw the data of process `rank` for the first step of this run, `step`. Only process 0
+        validates.
+        """
         if rank == 0:
             # At least 64 pixels at a time, because a draw has one source
             pixels = min(max(64, self.config.pixels.capture_pixels), VALIDATION_PIXELS)
@@ -178,12 +209,15 @@ class PixelTask:
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
 
-        Returns each shard's pixels and their additional rotations in degrees (P,), and whether all are mirrored.
+        Returns each shard's pixels and their additional rotations in degrees (P,), and whether all
+        are mirrored.
         """
         config = self.config
         canonical = config.network.is_canonical
         self.generator.manual_seed(stream_seed(config.seed, step, _BATCH_STREAM))
-        mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
+        mirrored = canonical and bool(
+            torch.rand((), generator=self.generator, device=self.device) < 0.5
+        )
         jitter_deg = config.turn_jitter_deg if canonical else 0.0
         pixels = config.batch_size // config.shards
         shards = []
@@ -197,7 +231,8 @@ class PixelTask:
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
         """Yield the losses of each of this process's shards of a step's batch."""
         shards, mirrored = self.draw(step)
-        # One shard at a time: its pixels have similar numbers of lights, so little computation is wasted on padding.
+        # One shard at a time: its pixels have similar numbers of lights, so little computation is
+        # wasted on padding.
         for batch, turn_deg in shards:
             yield compute_losses(
                 network,
@@ -221,7 +256,10 @@ class PixelTask:
         """Return the maps of up to SHOWN_PIXELS validation pixels, evenly spaced."""
         shown = self.validation[:: max(1, len(self.validation) // SHOWN_PIXELS)][:SHOWN_PIXELS]
         found = [_sample(network, batch, SHOWN_PIXELS // len(shown)) for batch in shown]
-        maps: list[Any] = [None if parts[0] is None else np.concatenate(parts) for parts in zip(*found, strict=True)]
+        maps: list[Any] = [
+            None if parts[0] is None else np.concatenate(parts)
+            for parts in zip(*found, strict=True)
+        ]
         return SampleMaps(*maps)
 
 
@@ -249,7 +287,9 @@ def _sample(network: SplineNet, batch: PixelBatch, count: int) -> SampleMaps:
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
 ) -> tuple[PixelMaps, Tensor | None, Tensor]:
-    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the pixels' frames."""
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals,
+    in the pixels' frames.
+    """
     network.eval()
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -272,14 +312,18 @@ class RefinementTask:
             raise UsageError(
                 "the refinement net learns from pixel sets of rendered scenes,"
                 " and the sources name the pixel generator",
-                hint="Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset refine",
+                hint=(
+                    "Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset"
+                    " refine"
+                ),
             )
         self.sets = open_sets(config)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         config = self.config
         seed = stream_seed(config.seed, rank, _POOL_STREAM)
-        first = -(-step // STEPS_PER_EXAMPLE)  # number of the first capture, with one added before step 0 and so on
+        # number of the first capture, with one added before step 0 and so on
+        first = -(-step // STEPS_PER_EXAMPLE)
         self.pool = self._pool(self.sets.training, network, seed, first=first)
         for _ in range(FIRST_EXAMPLES):
             self.pool.add()
@@ -303,13 +347,18 @@ class RefinementTask:
             maps = self.pool.draw(self.config.batch_size // self.config.shards, self.generator)
             with fixed(network, "refine_net"):
                 weight = self.config.detail_weight
-                found = refinement_losses(network, maps.to(self.device), detail_weight=weight, bfloat16=bfloat16)
+                found = refinement_losses(
+                    network, maps.to(self.device), detail_weight=weight, bfloat16=bfloat16
+                )
             yield Losses(found.total, found.angle, missing, missing, missing, missing)
 
     @torch.no_grad()
     def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
         network.eval()
-        found = [refinement_losses(network, maps.to(self.device), bfloat16=bfloat16).angle for maps in self.validation]
+        found = [
+            refinement_losses(network, maps.to(self.device), bfloat16=bfloat16).angle
+            for maps in self.validation
+        ]
         return math.degrees(float(torch.stack(found).mean()))
 
     def sample_maps(self, network: SplineNet) -> None:
