@@ -13,7 +13,7 @@ where the prediction has it. If it is elsewhere, the image is shifted: the peak 
 cross-correlation gives the distance.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from splinecli.capture.sample import Sample
 from splinecli.lights.light_fit import Factors
 from splinecli.lights.rough_normals import rough_normals
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 
@@ -274,12 +274,15 @@ def check_ground_truth(
     if not known.any():
         return []
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals
-    angles = [
-        float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T)))
-        for frame in _FRAMES
-    ]
-    best = int(np.argmin(angles))
+
+    def angle_in_deg(frame: LightFrame) -> float:
+        return float(np.median(angle_between_deg(normals[known], truth[known] @ frame.matrix.T)))
+
     # Metals reach 30 degrees in the right frame; another frame leaves at most half of the angle.
+    angles = [angle_in_deg(_FRAMES[0])]
+    if angles[0] > 20.0:
+        angles += map(angle_in_deg, _FRAMES[1:])
+    best = int(np.argmin(angles))
     if angles[0] <= 20.0 or angles[best] > 0.5 * angles[0]:
         return _shifted(normals, truth, sample)
     frame = _FRAMES[best]
@@ -306,6 +309,7 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     # Coarse to fine: the angle changes slowly with the shift.
     right, down, step = 0, 0, max(1, reach // 4)
     angles: dict[tuple[int, int], tuple[float, float]] = {}
+    angles_deg = _moved_angles(normals, truth)
     while step:
         around = (
             range(-reach, reach + 1, step) if not angles else range(-step * 2, step * 2 + 1, step)
@@ -314,7 +318,8 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
         for by_right in around:
             for by_down in around:
                 moved = middle[0] + by_right, middle[1] + by_down
-                angles.setdefault(moved, _angles_deg(normals, truth, moved))
+                if moved not in angles:
+                    angles[moved] = angles_deg(moved)
         right, down = min(angles, key=lambda moved: angles[moved][0] - angles[moved][1])
         step //= 2
     after, before = angles[right, down]
@@ -345,29 +350,37 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 
 
-def _angles_deg(
-    normals: Float64Array, truth: Floats, shift: tuple[int, int]
-) -> tuple[float, float]:
-    """Return the median angles in degrees between normals and a truth that is moved back, and not
-    moved.
+def _moved_angles(
+    normals: Float64Array, truth: Floats
+) -> Callable[[tuple[int, int]], tuple[float, float]]:
+    """Return a function of a shift (right, down): the median angles in degrees between normals
+    (h, w, 3) and a truth that is moved back, and not moved, in the same pixels.
     """
     height, width = normals.shape[:2]
-    right, down = shift
-    here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
-    there = (
-        slice(max(0, down), height - max(0, -down)),
-        slice(max(0, right), width - max(0, -right)),
-    )
-    moved = truth[there]
-    known: Bools = np.all(
-        [each.any(axis=2) for each in (normals[here], moved, truth[here])], axis=0
-    )
-    if np.count_nonzero(known) < max(1, 0.5 * np.count_nonzero(normals.any(axis=2))):
-        return 180.0, 0.0
-    every = slice(None, None, -(-int(np.count_nonzero(known)) // 4000))  # to save time
-    own = normals[here][known][every]
-    after, before = (
-        float(np.median(angle_between_deg(own, other[known][every])))
-        for other in (moved, truth[here])
-    )
-    return after, before
+    truth = unit(truth.astype(np.float64))
+    own_known, truth_known = normals.any(axis=2), truth.any(axis=2)
+    both, least = own_known & truth_known, max(1, 0.5 * np.count_nonzero(own_known))
+    unmoved = np.einsum("hwc,hwc->hw", normals, truth)
+
+    def angles_deg(shift: tuple[int, int]) -> tuple[float, float]:
+        right, down = shift
+        here, there = (
+            (slice(max(0, -y), height - max(0, y)), slice(max(0, -x), width - max(0, x)))
+            for x, y in ((right, down), (-right, -down))
+        )
+        places = np.flatnonzero(both[here] & truth_known[there])
+        if len(places) < least:
+            return 180.0, 0.0
+        places = places[:: -(-len(places) // 4000)]  # to save time
+        rows, columns = np.divmod(places, width - abs(right))
+        cosines = np.einsum(
+            "pc,pc->p", normals[here][rows, columns], truth[there][rows, columns]
+        )
+        # The median of the angles is the angle of the median, up to rounding.
+        after, before = (
+            float(np.degrees(np.arccos(np.median(each).clip(-1, 1))))
+            for each in (cosines, unmoved[here][rows, columns])
+        )
+        return after, before
+
+    return angles_deg
