@@ -210,11 +210,10 @@ class _MatteModel:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
         self._found: dict[int, _Compared | None] = {}  # of this fit
-        # Shifts are compared up to this share of the smaller side of the object.
-        self.reach = max(
-            2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask)))
-        )
-        self._sums = _ShiftedSums(mask, self.reach)
+        # Shifts are compared up to this share of the smaller side of the object. Wrong models often
+        # keep improving towards larger shifts.
+        reach = max(2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
+        self._sums = _ShiftedSums(mask, int(0.75 * reach))
         self._values = images[:, mask].T.copy()
         self._known = np.zeros(self._values.shape, np.bool_)
         self._known[:, slice(None) if fitted is None else list(fitted)] = True
@@ -356,20 +355,12 @@ class _MatteModel:
         return array
 
 
-def _near(reach: int) -> Bools:
-    """Return which shifts (h, w) are accepted: wrong models often keep improving towards the
-    largest ones.
-    """
-    around = np.abs(np.arange(-reach, reach + 1))
-    return np.asarray(np.maximum(around[:, None], around) <= 0.75 * reach)
-
-
 def _may_be_moved(most_unmoved: Float64Array, least_fall: float, usual: float) -> bool:
     """Return whether _least may accept a shift, from bounds (h, w) of the unmoved residuals.
 
     This saves most of the Fourier transforms of a still capture.
     """
-    most = most_unmoved[_near(len(most_unmoved) // 2)].max() * (1 + 1e-6)  # for rounding
+    most = most_unmoved.max() * (1 + 1e-6)  # for rounding
     return bool(most >= max(least_fall, _UNUSUAL * usual) and _UNUSUAL * usual <= _LARGEST)
 
 
@@ -382,8 +373,7 @@ def _least(
     reach = len(left) // 2
     with np.errstate(invalid="ignore"):
         counts = (
-            _near(reach)
-            & (unmoved - left >= least_fall)
+            (unmoved - left >= least_fall)
             & (unmoved <= _LARGEST)
             & (unmoved >= _UNUSUAL * usual)
         )
