@@ -182,6 +182,12 @@ class CaptureSample:
         )
 
     def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
+        key = tuple(shifts)
+        if key not in self._checks_of_moved:
+            self._checks_of_moved[key] = self._check_moved(shifts)
+        return self._checks_of_moved[key]
+
+    def _check_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
         known, values = moved_back(
             replace(self.sample, observations=self.observations), self._on_grid(shifts)
         )
@@ -191,6 +197,10 @@ class CaptureSample:
         return check_lights(
             values[known], mask, self.all_directions, self.indices, self.names, factors
         )
+
+    @cached_property
+    def _checks_of_moved(self) -> dict[tuple[ImageShift, ...], LightCheck]:
+        return {}
 
     def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
         step = self.sample.step

@@ -49,7 +49,8 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
         return {}
     images = np.zeros((len(light_directions), *sample.mask.shape))
     images[:, sample.mask] = sample.observations.T
-    model = _MatteModel(images[:, ::stride, ::stride], mask, light_directions)
+    images, mask = _cropped(images[:, ::stride, ::stride], mask)
+    model = _MatteModel(images, mask, light_directions)
     n_images = len(images)
     halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= _MANY_IMAGES else ()
     together = []
@@ -75,6 +76,11 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
         if fall > 0 and shift != model.shifts.get(place):
             model.move(place, shift)
     return {place: (stride * right, stride * down) for place, (right, down) in model.shifts.items()}
+
+
+def _cropped(images: Float64Array, mask: Bools) -> tuple[Float64Array, Bools]:
+    rows, columns = (slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
+    return images[:, rows, columns], mask[rows, columns]
 
 
 def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Float64Array]:
@@ -154,6 +160,10 @@ class _Compared:
     ) -> Float64Array:
         found = _residual(of_normals[0], of_normals[1:], of_image, squares)
         return np.where(self._enough, found / self._brightness, np.inf)
+
+    def may_leave(self, most_left: float) -> Bools:
+        """Return which shifts (h, w) may leave at most this share of the residual."""
+        return np.asarray(self.left <= most_left * (1 + 1e-6) * self.most_unmoved)  # for rounding
 
     @cached_property
     def most_unmoved(self) -> Float64Array:
@@ -292,7 +302,10 @@ class _MatteModel:
             return _NO_SHIFT
         # Gloss on a rendered sphere under eight lights reached 0.4.
         most_left = _LEFT if len(self.images) >= _MANY_IMAGES else 0.35
-        if not _may_be_moved(compared.most_unmoved, 0.03, usual):
+        if not (
+            _may_be_moved(compared.most_unmoved, 0.03, usual)
+            and compared.may_leave(most_left).any()
+        ):
             return _NO_SHIFT
         fall, shift = _least(compared.left, compared.unmoved, 0.03, most_left, usual)
         return (
@@ -309,13 +322,18 @@ class _MatteModel:
         most = np.median([each.most_unmoved for each in found], axis=0)
         if not _may_be_moved(most, 0.02, usual):
             return _NO_SHIFT
+        most_left, fitting = 0.6, np.full(most.shape, len(found))
+        for each in found:  # until no shift can fit half of the images
+            fitting -= ~each.may_leave(most_left)
+            if fitting.max() < len(found) / 2:
+                return _NO_SHIFT
         with np.errstate(
             invalid="ignore", divide="ignore"
         ):  # medians, so that one shifted image does not decide
             shares = np.median([each.left / each.unmoved for each in found], axis=0)
         unmoved = np.median([each.unmoved for each in found], axis=0)
         known = np.isfinite(shares) & np.isfinite(unmoved)
-        return _least(np.where(known, shares * unmoved, np.inf), unmoved, 0.02, 0.6, usual)
+        return _least(np.where(known, shares * unmoved, np.inf), unmoved, 0.02, most_left, usual)
 
     def _left_in_halves(
         self,
