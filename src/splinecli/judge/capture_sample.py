@@ -1,62 +1,22 @@
-"""The input of the checks: a capture's lights, from files or arguments,
-and a sample of its pixels.
-"""
+"""The evidence of a capture that is read from files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.formats.decoders import page_of
-from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
-from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
-from splinecli.judge.light_check import LightCheck, check_lights
-from splinecli.judge.odd_images import ImageShift, find_shifts
-from splinecli.judge.readings import Doubt, Kind, Readings
-from splinecli.judge.shading_shifts import moved_back, shading_shifts
-from splinecli.lights.light_fit import Factors, find_factors
-from splinecli.lights.rough_normals import median_turn_deg
-from splinecli.maths import Float64Array, Floats
-from splinecli.maths.robust import solve_each
+from splinecli.judge.evidence import Evidence, gray_intensities
+from splinecli.maths import Floats
 from splinecli.system.files import equal_files, reading
 
 
 @dataclass(frozen=True, eq=False)
-class CaptureSample:
-    """F images and their lights, the input of the checks; results that several checks need are
-    computed once.
-    """
-
-    names: Sequence[str]
-    all_directions: Float64Array  # (N, 3), all lights of the file, in its order
-    indices: Sequence[int]  # (F,), the lights of the images
-    sample: Sample  # not divided by estimated intensities, as the closeup
-    closeup: Sample
-    intensities_measured: bool  # whether the intensities are given
-    # (F,), the given ones, by which the observations were divided
-    intensities: Float64Array | None = None
-    # (F,), the estimated ones, by which the sample was not divided
-    estimated: Float64Array | None = None
-    eight_bit: bool = False  # whether the images have 8 bits
-    # all near lamps, over the sample's grid; None if the lights are treated as distant
-    lamps: NearLamps | None = None
-    has_positions: bool = False  # whether positions of lamps are known
-    # whether the lights were found from these images, so that the images cannot contradict them
-    found: bool = False
-    origin: Path = Path("light_directions")
-    frame: LightFrame = USUAL_FRAME
-    linear: bool = True  # whether the values of the images are taken as linear
-    truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
-    strict: bool = False  # also warn of properties that the images leave undetermined
-    in_channels: bool = False  # whether each channel of a colour image has a light of its own
-    copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
-    background: float = 0.0  # the share of dark background that was left out of the sample
+class CaptureSample(Evidence):
+    """The evidence of images and lights in files."""
 
     @classmethod
     def of_source(
@@ -102,155 +62,3 @@ class CaptureSample:
             in_channels=source.channels is not None,
             copies=copies,
         )
-
-    @cached_property
-    def directions(self) -> Float64Array:
-        """The directions (F, 3) of the images' lights."""
-        return self.all_directions[list(self.indices)]
-
-    @cached_property
-    def observations(self) -> Floats:
-        """The sample's observations (p, F) as they would be if near lamps were distant.
-
-        The surface is assumed to be a plane. The part that a matte surface explains is replaced;
-        the rest, such as the residual of lights in a wrong order, is kept.
-        """
-        if self.lamps is None:
-            return self.sample.observations
-        lamps = self.lamps.choose_lights(self.indices)
-        near, attenuation = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
-        observations = self.sample.observations / attenuation
-        scaled_normals = solve_each(observations, near)
-        return np.asarray(
-            observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals)
-        )
-
-    @cached_property
-    def factors(self) -> Factors | None:
-        return find_factors(self.observations, intensities_known=self.intensities_measured)
-
-    @cached_property
-    def evened(self) -> Sample:
-        """The sample, divided by the best-fitting intensities unless they were measured.
-
-        This keeps unequal lamps from looking like a fault of the directions or the values.
-        """
-        intensities = (
-            1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
-        )
-        return replace(self.sample, observations=self.observations / intensities)
-
-    @cached_property
-    def readings(self) -> Readings:
-        """The sample as the files store it, to be read in other ways."""
-        observations = (
-            self.observations if self.intensities is None else self.observations * self.intensities
-        )
-        sample = replace(self.sample, observations=observations)
-        return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
-
-    @cached_property
-    def doubt(self) -> Doubt | None:
-        """The other reading that fits the images best, and its probability; None if the readings
-        cannot be compared.
-        """
-        kinds: set[Kind] = {"offset", "intensities"}
-        if self.linear:
-            kinds.add("curve")
-        if not self.has_positions:
-            kinds.add("near")
-        # Estimated intensities are divided out.
-        accepted: set[Kind] = set() if self.estimated is None else {"intensities"}
-        return self.readings.likeliest(kinds, accepted=accepted)
-
-    @cached_property
-    def light_check(self) -> LightCheck:
-        """The result of comparing the images with their lights,
-        after moving shifted images back.
-        """
-        return self._check_of_moved(self.shifts) if self.shifts else self._check_as_given
-
-    @cached_property
-    def _check_as_given(self) -> LightCheck:
-        return check_lights(
-            self.observations,
-            self.sample.mask,
-            self.all_directions,
-            self.indices,
-            self.names,
-            self.factors,
-        )
-
-    def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
-        key = tuple(shifts)
-        if key not in self._checks_of_moved:
-            self._checks_of_moved[key] = self._check_moved(shifts)
-        return self._checks_of_moved[key]
-
-    def _check_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
-        known, values = moved_back(
-            replace(self.sample, observations=self.observations), self._on_grid(shifts)
-        )
-        mask = np.zeros_like(self.sample.mask)
-        mask[self.sample.mask] = known
-        factors = find_factors(values[known], intensities_known=self.intensities_measured)
-        return check_lights(
-            values[known], mask, self.all_directions, self.indices, self.names, factors
-        )
-
-    @cached_property
-    def _checks_of_moved(self) -> dict[tuple[ImageShift, ...], LightCheck]:
-        return {}
-
-    def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
-        step = self.sample.step
-        return {
-            shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts
-        }
-
-    @cached_property
-    def shifts(self) -> list[ImageShift]:
-        found = find_shifts(self.closeup) or (
-            find_shifts(self.sample) if self.sample.step > 1 else []
-        )
-        if self.found:
-            return found
-        step = self.sample.step
-        of_shading = shading_shifts(self.evened, self.directions)
-        shifts = {shift.place: shift for shift in found}
-        shifts |= {
-            place: ImageShift(place, step * right, step * down)
-            for place, (right, down) in of_shading.items()
-        }
-        together = [shifts[place] for place in sorted(shifts)]
-        if (
-            not of_shading
-            or self._check_as_given.order is None
-            or self._check_of_moved(together).order is None
-        ):
-            return together
-        return found  # the lights are in another order, so they cannot predict shading
-
-    @cached_property
-    def shift_error_deg(self) -> float | None:
-        """The median angle by which shifted images change the normals; None if too few pixels are
-        left.
-        """
-        if self.found:
-            return None
-        known, values = moved_back(self.evened, self._on_grid(self.shifts))
-        if not known.any():
-            return None
-        return median_turn_deg(
-            self.evened.observations[known], self.directions, self.directions, values[known]
-        )
-
-
-def gray_intensities(intensities: Floats) -> Float64Array:
-    """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are
-    divided out.
-    """
-    values = np.asarray(intensities, np.float64)
-    if values.ndim == 2:
-        values = 1 / (1 / values).mean(axis=1)
-    return np.asarray(values / values.mean())

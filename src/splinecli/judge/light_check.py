@@ -15,7 +15,7 @@ import numpy as np
 
 from splinecli.capture.light_rows import BOTH_NEGATED, PLANE_FRAMES, LightFrame
 from splinecli.judge.light_order import (
-    FEWEST_LIGHTS,
+    FEWEST_TO_ORDER,
     HALF_LEFT,
     HALF_VECTORS,
     LARGEST_MENDED,
@@ -90,7 +90,7 @@ class LightCheck:
         missing = []
         if np.isnan(self.given_misfit):
             missing.append(
-                f"their order (fewer than {FEWEST_LIGHTS} lights, too few lit pixels, or a flat"
+                f"their order (fewer than {FEWEST_TO_ORDER} lights, too few lit pixels, or a flat"
                 " object)"
             )
         if self.order == UNKNOWN_ORDER or self.best is not None:
@@ -258,9 +258,7 @@ def _by_shadows(
     for one in (given, best):
         twin = _negated(judged, one)
         if twin is not None and (one is given or one.advantage >= 1):
-            told[twin.name] = (
-                (shadows, of_negated) if one is given else check.shadows(one.matrix)
-            )
+            told[twin.name] = (shadows, of_negated) if one is given else check.shadows(one.matrix)
     judged = [
         replace(
             other, advantage=other.advantage + told[other.name][0].evidence(told[other.name][1])

@@ -33,8 +33,8 @@ Complex128Array = NDArray[np.complex128]
 Shift = tuple[int, int]  # right, down
 _NO_SHIFT = 0.0, (0, 0)
 # The residual of a shifted image is so many times the lower quartile of the images' residuals. If
-# the model fits no image well, as on polished balls, it does not show which is shifted. Metals leave
-# more than the second.
+# the model fits no image well, as on polished balls, it does not show which is shifted. Metals
+# leave more than the second.
 _UNUSUAL, _LARGEST = 2.0, 0.6
 
 
@@ -391,9 +391,7 @@ def _least(
     reach = len(left) // 2
     with np.errstate(invalid="ignore"):
         counts = (
-            (unmoved - left >= least_fall)
-            & (unmoved <= _LARGEST)
-            & (unmoved >= _UNUSUAL * usual)
+            (unmoved - left >= least_fall) & (unmoved <= _LARGEST) & (unmoved >= _UNUSUAL * usual)
         )
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]

@@ -32,7 +32,7 @@ from splinecli.records.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECT
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 MIN_PIXELS_PER_LIGHT = 10
 LIGHT_ERROR_DEG, LARGEST_LIGHT_ERROR_DEG = 5.0, 30.0  # usual and largest error of a rough direction
-MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
+FEWEST_TO_REFINE = 6  # with fewer lights, an error of a light looks like an error of the normals
 INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
 _MIN_PIXELS = 100
 _PRIOR = 1e-9
@@ -229,8 +229,8 @@ def refine_capture(
     )
     if found is None:
         reason = "no directions near them fit the images much better"
-        if capture.n_lights < MIN_LIGHTS:
-            reason = f"there are fewer than {MIN_LIGHTS} lights"
+        if capture.n_lights < FEWEST_TO_REFINE:
+            reason = f"there are fewer than {FEWEST_TO_REFINE} lights"
         elif _choose_pixels(capture.observations) is None:
             reason = f"there are fewer than {_MIN_PIXELS} lit pixels"
         kept = CaptureWarning(
@@ -389,7 +389,7 @@ def _choose_pixels(observations: Float32Array) -> Float64Array | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too
     few.
     """
-    if observations.shape[1] < MIN_LIGHTS:
+    if observations.shape[1] < FEWEST_TO_REFINE:
         return None
     _, values = lit_values(observations, 0.02, 2000)
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None

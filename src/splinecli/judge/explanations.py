@@ -44,7 +44,7 @@ _SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class Explanation:
     """A reading of the images, and how well it fits."""
 
     kind: Kind
@@ -59,7 +59,7 @@ class Reading:
 class Doubt(NamedTuple):
     """How likely the given reading is wrong, and the reading that is right then."""
 
-    reading: Reading
+    reading: Explanation
     probability: float  # that any other reading is right
     others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
 
@@ -71,7 +71,7 @@ class _Fit:
     intensities: Float64Array
 
 
-class Readings:
+class Explanations:
     """The pixels of a sample, whose observations are as stored, and the readings that were fitted
     to them.
 
@@ -104,7 +104,7 @@ class Readings:
         self.shape, self.eight_bit = sample.mask.shape, eight_bit
         self.are_enough = n_lights >= 4 and len(self.values) >= 60
 
-    def fit(self, kinds: Collection[Kind]) -> list[Reading]:
+    def fit(self, kinds: Collection[Kind]) -> list[Explanation]:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
         if not self.are_enough:
             return []
@@ -112,7 +112,7 @@ class Readings:
             kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]
         ]
         vectors = self._with(self.lights)
-        (given,), found = _fit(self.values, vectors), list[Reading]()
+        (given,), found = _fit(self.values, vectors), list[Explanation]()
         if "offset" in kinds:
             found.append(_best("offset", self._offset_fits(vectors), given))
         if "curve" in kinds:
@@ -163,11 +163,11 @@ class Readings:
             (reading for reading in found if reading.kind == ranked[0]),
             key=lambda reading: reading.evidence,
         )
-        # Readings that are this likely, compared with the likeliest one, are named beside it.
+        # Explanations that are this likely, compared with the likeliest one, are named beside it.
         others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
         return Doubt(best, sum(shares.values()), tuple(others))
 
-    def error_deg(self, reading: Reading, used: Float64Array | None = None) -> float:
+    def error_deg(self, reading: Explanation, used: Float64Array | None = None) -> float:
         """Return the median angle in degrees between a reading's normals and the given reading's.
 
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
@@ -176,15 +176,18 @@ class Readings:
         (given,) = _fit(self.values, self._with(lights))
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
-    def _best_curve(self, *, free: bool = False) -> Reading:
+    def _best_curve(self, *, free: bool = False) -> Explanation:
         # encoded shadows are brighter
         vectors, gammas = self._with(self.lights), (1.0, *_EXPONENTS)
         given, *fits = _fit(self.values, vectors, gammas, free=free, shadow=0.35)
         return _best(
-            "curve", dict(zip(_EXPONENTS, fits, strict=True)), given, -0.8 if self.eight_bit else 0.0
+            "curve",
+            dict(zip(_EXPONENTS, fits, strict=True)),
+            given,
+            -0.8 if self.eight_bit else 0.0,
         )
 
-    def _best_near(self, given: _Fit) -> Reading:
+    def _best_near(self, given: _Fit) -> Explanation:
         """Return the best distance. Intensities are free: near lamps look unequal, and unequal
         lamps may be near.
         """
@@ -227,7 +230,7 @@ class Readings:
         return lights if self.intensities is None else lights * self.intensities[:, None]
 
 
-def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
+def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Explanation:
     """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
 
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
@@ -246,7 +249,7 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
         # full weight, and the share of the weight for a plate.
         power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
-    return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
+    return Explanation(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 
 def _cost_of_equal(intensities: Float64Array) -> float:
