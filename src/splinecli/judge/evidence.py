@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from splinecli.capture import Capture
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
+from splinecli.capture.source import Source
 from splinecli.judge.explanations import Doubt, Explanations, Kind
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
+from splinecli.judge.summary import closeup_of, sample_observations
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
@@ -56,6 +59,40 @@ class Evidence:
     in_channels: bool = False  # whether each channel of a colour image has a light of its own
     copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
     background: float = 0.0  # the share of dark background that was left out of the sample
+
+    @classmethod
+    def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> Evidence:
+        """Return the evidence of a capture that was prepared from this source."""
+        indices, measured = capture.light_indices, source.intensities_measured
+        sample = sample_observations(capture.observations, capture.mask)
+        if capture.estimated_intensities is not None:
+            # They were estimated under the lights that are in question.
+            stored = sample.observations * capture.estimated_intensities
+            sample = replace(sample, observations=stored)
+        closeup = closeup_of(capture.mask)
+        return cls(
+            source.image_names(indices),
+            source.light_directions,
+            indices,
+            sample,
+            sample_observations(capture.observations, capture.mask, closeup),
+            measured,
+            intensities=gray_intensities(source.light_intensities[list(indices)])
+            if measured
+            else None,
+            estimated=capture.estimated_intensities,
+            eight_bit=source.has_8_bits(indices),
+            lamps=source.lamps_on_grid(sample.mask, sample.step),
+            has_positions=source.has_positions,
+            found=capture.light_errors_deg is not None,
+            origin=source.lights_file,
+            frame=source.light_frame,
+            linear=source.is_linear,
+            truth=capture.ground_truth,
+            strict=strict,
+            in_channels=source.in_channels,
+            copies=source.equal_images(indices),
+        )
 
     @cached_property
     def directions(self) -> Float64Array:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture import capture_name, open_capture
+from splinecli.capture import CaptureOptions, capture_name, open_capture
 from splinecli.capture.files import digest
 from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.system.files import file_sha256, free_name, replacing
 from splinecli.system.machine import import_extra
 from splinecli.workshop.pixel_sets.store import ARRAYS, Pixels, PixelSetWriter
@@ -64,7 +65,7 @@ def add_capture(
     it changed since its entry was created, and `update` is not set; OutputError if the entry cannot
     be written.
     """
-    source = open_capture(folder, white_level=white_level)
+    source = open_capture(folder, CaptureOptions(white_level=white_level))
     recipe: dict[str, Any] = {
         "source": str(folder.resolve()),
         "reading": name_reading(as_stored=as_stored),
@@ -90,7 +91,7 @@ def add_capture(
             raise CaptureChangedError(problem, path=folder, hint=hint)
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
-    capture = source.read(as_stored=as_stored)
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=as_stored))
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
     # The PRPS images of CyclesPS are used at half resolution.
