@@ -34,14 +34,7 @@ from splinecli.system.files import (
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 # treated as images only in a folder without others
-_RARE = (
-    ".pgm",
-    ".ppm",
-    ".webp",
-    ".avif",
-    ".heic",
-    ".heif",
-)
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
 # suffixes of images of an object

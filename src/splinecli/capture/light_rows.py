@@ -44,11 +44,7 @@ class LightFrame:
     """The frame of a light file."""
 
     # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
-    signs: tuple[int, int, int] = (
-        1,
-        1,
-        1,
-    )
+    signs: tuple[int, int, int] = (1, 1, 1)
     # whether the file has y before x. The signs belong to x and y in either order
     exchanged: bool = False
 

@@ -18,7 +18,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
@@ -34,6 +33,7 @@ from splinecli.lights.lighting import (
     PixelPlaces,
     parts_of_pixels,
 )
+from splinecli.maths import Bools, Float32Array
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.maths.pixel_grid import Blocks, rays_at
 from splinecli.surface.integration import integrate_normals
@@ -91,11 +91,11 @@ class NormalEstimate:
     """
 
     capture: Capture
-    normal_map: NDArray[np.float32]
+    normal_map: Float32Array
     seconds: float
-    error_map_deg: NDArray[np.float32] | None = None
+    error_map_deg: Float32Array | None = None
     errors: AngularErrors | None = None
-    confidence_map: NDArray[np.float32] | None = None
+    confidence_map: Float32Array | None = None
     capture_judged: bool = False
 
     @property
@@ -156,7 +156,7 @@ def estimate_normals(
 
 def _estimate(
     capture: Capture, estimator: Estimator, progress: Progress, clock: Clock
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
+) -> tuple[Float32Array, Float32Array | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover
     the whole capture.
 
@@ -198,14 +198,14 @@ class PixelEstimates(NamedTuple):
     that was removed.
     """
 
-    normals: NDArray[np.float32]
-    errors: NDArray[np.float32] | None
+    normals: Float32Array
+    errors: Float32Array | None
     lighting_at: LightingAt
 
 
 def estimate_pixels(
-    mask: NDArray[np.bool_],
-    observations: NDArray[np.float32],
+    mask: Bools,
+    observations: Float32Array,
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
     progress: Progress = ignore,
@@ -288,7 +288,7 @@ def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndice
     return lighting_without
 
 
-def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
+def _confidence(errors: Float32Array) -> Float32Array:
     """Return the confidence (P,) from distributions of errors (P, 2), without further arrays of
     their size.
     """
@@ -298,7 +298,7 @@ def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
     return found
 
 
-def _check_unit(normals: NDArray[np.float32], method: str) -> None:
+def _check_unit(normals: Float32Array, method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)

@@ -42,10 +42,7 @@ _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _SURE = 0.1  # the error of a roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
 # of the bright pixels' albedo and the mean observation: errors of all observations
-_FLOOR, _FLAT = (
-    0.005,
-    0.12,
-)
+_FLOOR, _FLAT = (0.005, 0.12)
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence

@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.estimator import (
@@ -28,7 +28,7 @@ from splinecli.estimate.networks.spline_net import Rotation
 from splinecli.estimate.networks.weights import LoadedNetwork, untrained_warning
 from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting, PixelPlaces
-from splinecli.maths import Bools, Floats
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
 from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
@@ -61,7 +61,7 @@ class BatchedEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> NDArray[np.float32]:
+    ) -> Float32Array:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3);
         see Estimator.
         """
@@ -72,7 +72,7 @@ class BatchedEstimator(Estimator):
             # The length may be tiny, and normalize would treat such a vector as zero. So divide in
             # two steps.
             largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
-            return torch.nn.functional.normalize(normals / largest, dim=1)
+            return normalize(normals / largest, dim=1)
 
         return estimate_in_batches(
             solve_scaled,
@@ -98,7 +98,7 @@ def estimate_in_batches(
     dtype: torch.dtype,
     columns: int = 3,
     progress: Progress = ignore,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Call `solve` on batches of observations, side by side, and return its results (P, columns) as
     float32.
 
@@ -281,7 +281,7 @@ class NetworkEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Float32Array, Float32Array]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 
         The numbers of the distributions are means over the rotations, and 0 without an error head.
@@ -318,7 +318,7 @@ class NetworkEstimator(Estimator):
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3:] += error
-        unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
+        unit = normalize(total[:, :3], dim=-1)
         averaged = torch.cat((unit, total[:, 3:] / len(self._rotations)), dim=1)
         dark = batch.amax(dim=1) <= 0
         averaged[dark] = averaged.new_tensor((0.0, 0.0, 0.0, *UNKNOWN_ERROR))
@@ -330,7 +330,7 @@ class NetworkEstimator(Estimator):
         observations: Observations,
         light_directions: Directions,
         all_observations: Observations,
-        all_directions: NDArray[np.float64],
+        all_directions: Float64Array,
     ) -> ObservationMaps | None:
         """Return the network's input, LI-Net's output, and the maps of all observations; see
         Estimator.
@@ -349,7 +349,7 @@ class NetworkEstimator(Estimator):
         values = all_seen / maps.scale
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
-        def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:
+        def known(values: Tensor, occupied: Tensor) -> Float32Array:
             return np.asarray(
                 values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32
             )

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import linear, normalize
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from splinecli.errors import UsageError
@@ -34,7 +34,7 @@ from splinecli.estimate.methods.estimator import (
 )
 from splinecli.estimate.networks.li_ne_net import median_error_deg
 from splinecli.lights.lighting import LightingAt
-from splinecli.maths import Bools
+from splinecli.maths import Bools, Float32Array
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import map_scale
 from splinecli.system.machine import one_thread_each, side_by_side
@@ -131,10 +131,7 @@ BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 # decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
-_MOMENTUM, _SQUARES = (
-    0.9,
-    0.99,
-)
+_MOMENTUM, _SQUARES = (0.9, 0.99)
 _ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 
@@ -184,11 +181,9 @@ class Perceptron(nn.Module):
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
-            return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
+            return torch.cat((scaled, normalize(scaled @ self.solve, dim=1)), dim=1)
         fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
-        return torch.cat(
-            (scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1
-        )
+        return torch.cat((scaled, light_directions.mean(dim=1), normalize(fitted, dim=1)), dim=1)
 
     def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
         """Return unit normals (P, 3) and the distributions of their errors (P, 2); see
@@ -202,7 +197,7 @@ class Perceptron(nn.Module):
             for layer in hidden:
                 scaled = layer(scaled).relu_()
         found = last(scaled.to(inputs.dtype))
-        return nn.functional.normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
+        return normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
 
     def gradient(self, inputs: Tensor, normals: Tensor, errors: Tensor) -> list[Tensor]:
         """Return the gradients of the loss, in the order of `parameters`.
@@ -215,8 +210,8 @@ class Perceptron(nn.Module):
         (*weights, last), (*biases, offset) = self._weights_and_biases()
         passed = [(inputs - self.mean) / self.spread]
         for weight, bias in zip(weights, biases, strict=True):
-            passed.append(nn.functional.linear(passed[-1], weight, bias).relu_())
-        found = nn.functional.linear(passed[-1], last, offset)
+            passed.append(linear(passed[-1], weight, bias).relu_())
+        found = linear(passed[-1], last, offset)
         corrected = inputs[:, -3:] + found[:, :3]
         length = corrected.norm(dim=1, keepdim=True).clamp_(min=1e-12)
         unit = corrected / length
@@ -373,7 +368,7 @@ class DistilledEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Float32Array, Float32Array]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see
         Estimator.
         """

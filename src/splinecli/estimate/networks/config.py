@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import torch
 from msgspec import Meta
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.errors import ModelError
 from splinecli.estimate.fits.ia14 import solve_ia14
@@ -55,7 +56,7 @@ def fit_normals(
     observed = torch.where(valid, observations, 0).clamp(min=0).double()
     lights = light_directions.double()
     found = torch.stack([STARTING_FITS[name](observed, lights, valid) for name in names], dim=1)
-    return torch.nn.functional.normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
+    return normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
 
 
 Depth = Annotated[int, Meta(ge=1, le=64)]  # each layer takes memory, whatever its size

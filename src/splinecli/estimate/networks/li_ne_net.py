@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear, pixel_shuffle, pixel_unshuffle, softplus
 
 from splinecli.estimate.networks.config import NetworkConfig
 
@@ -111,9 +112,7 @@ class MapEncoder(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         if maps.shape[-1] == SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
             return self._few_products(maps)
-        patches = nn.functional.pixel_unshuffle(maps, PATCH).contiguous(
-            memory_format=torch.channels_last
-        )
+        patches = pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
         features: Tensor = self.blocks(self.patches(patches) + self.position)
         return features
 
@@ -129,10 +128,7 @@ class MapEncoder(nn.Module):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
             split = maps[start : start + _AT_ONCE].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
             patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
-            x = (
-                nn.functional.linear(patches, self.patches.weight.flatten(1), self.patches.bias)
-                + position
-            )
+            x = linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
             for first, second in zip(
                 layers[::2], layers[1::2], strict=True
             ):  # of each residual block
@@ -180,7 +176,7 @@ def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
     """
     median, shape = error.unbind(-1)
     z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
-    return z + 2 * nn.functional.softplus(-z) - shape
+    return z + 2 * softplus(-z) - shape
 
 
 def probability_within(error: Tensor, limit_deg: float) -> Tensor:
@@ -305,7 +301,7 @@ class CompactLINet(nn.Module):
         self.decoder = zeroed(nn.Conv2d(config.width, PATCH**2, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
-        return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)
+        return pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)
 
 
 DROPOUT = 0.2  # share of the channels dropped in training at the paper size

@@ -13,10 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import normalize, scaled_dot_product_attention
 
 from splinecli.estimate.fits.least_squares import direction_products, weighted_sum
 from splinecli.estimate.networks.config import HEAD_WIDTH
 from splinecli.estimate.networks.li_ne_net import zeroed
+from splinecli.maths import Floats
 from splinecli.maths.robust import inverse_3x3, lit_values, multiply_symmetric
 
 SAMPLE = 512  # number of pixels of a capture that all its pixels attend to
@@ -48,7 +50,7 @@ class PixelTokens(NamedTuple):
     n_lights: Tensor  # (P, 1), the number of lights
 
 
-def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
+def sample_of(observations: Floats) -> NDArray[np.intp]:
     """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in
     (P, F).
 
@@ -111,7 +113,7 @@ class ContextLayer(nn.Module):
                 summary.keys,
                 summary.values,
             )
-            found = nn.functional.scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
+            found = scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
         seen = torch.cat(
             (queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2
         )
@@ -177,7 +179,7 @@ class SetBranch(nn.Module):
         to capture p % `captures`. Without a context, the pixels of each capture attend to each
         other.
         """
-        half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
+        half = normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + 1e-3).log()  # the offset keeps the logarithm finite
         values = torch.stack((observed, log_observed, residual), dim=-1)
         features = torch.cat((lights, values, lights @ normals.mT, half @ normals.mT), dim=-1)
@@ -240,9 +242,7 @@ class _AttentionLayer(nn.Module):
             # to six times.
             queries, keys, values = queries.float(), keys.float(), values.float()
         with torch.autocast(tokens.device.type, enabled=False):
-            attended = nn.functional.scaled_dot_product_attention(
-                queries, keys, values, attn_mask=mask
-            )
+            attended = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out
@@ -256,4 +256,4 @@ def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor
     # If otherwise undetermined, the normal points to the camera.
     vector = weighted_sum(weight * targets, lights) + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
     scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
-    return nn.functional.normalize(torch.stack(scaled, dim=-1), dim=-1)
+    return normalize(torch.stack(scaled, dim=-1), dim=-1)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.networks.config import NetworkConfig, fit_normals
@@ -207,7 +208,7 @@ class SplineNet(nn.Module):
             raw, error = self.ne_net(
                 torch.cat((*channels, *interpolated), dim=1), normals, features
             )
-        return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
+        return Estimate(normalize(raw.float(), dim=-1), error)
 
     def forward(
         self,

@@ -10,21 +10,19 @@ A capture at half the resolution, and its results at the full one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from splinecli.estimate.networks.refine_net import gaussian_sum, reach_of, unit_maps
 from splinecli.estimate.refinement.tiles import Box, pixels_before
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
+from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.normals import unit
 from splinecli.system.machine import side_by_side
 
-Floats = NDArray[np.float32]
 # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 _DARK = 1e-6
 
@@ -35,10 +33,10 @@ class HalfCapture:
     another capture.
     """
 
-    mask: NDArray[np.bool_]  # (H / 2, W / 2), with Q true pixels
-    observations: Floats  # (Q, F)
-    normals: Floats  # (Q, 3), unit, in the capture's frame
-    errors: Floats  # (Q, 2)
+    mask: Bools  # (H / 2, W / 2), with Q true pixels
+    observations: Float32Array  # (Q, F)
+    normals: Float32Array  # (Q, 3), unit, in the capture's frame
+    errors: Float32Array  # (Q, 2)
     # (Q,), the row in the other capture of one pixel of each block, whose lights hold for it
     members: PixelIndices
     whole: LightingAt  # gives the light of the other capture's pixels
@@ -46,10 +44,10 @@ class HalfCapture:
     @classmethod
     def of(
         cls,
-        mask: NDArray[np.bool_],
+        mask: Bools,
         lighting_at: LightingAt,
-        normals: Floats,
-        errors: Floats,
+        normals: Float32Array,
+        errors: Float32Array,
         reference: float,
     ) -> HalfCapture:
         """Return half of a capture with a mask (H, W), both even, of P true pixels, and the
@@ -130,11 +128,11 @@ def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """
     weights = mask.to(maps)[None]
     weighed = torch.cat((maps * weights, weights))[None]
-    found = torch.nn.functional.interpolate(weighed, scale_factor=2, mode="bilinear")[0]
+    found = interpolate(weighed, scale_factor=2, mode="bilinear")[0]
     return found[:-1] / found[-1:].clamp(min=1e-6)
 
 
-def _over_blocks(function: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+def _over_blocks(function: np.ufunc, values: Array) -> Array:
     """Return a function of the four values (H, W, ...) in each block of 2 x 2, (H / 2, W / 2,
     ...).
     """

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.estimate.fits import least_squares
 from splinecli.estimate.fits.least_squares import TwoHalves, weighted_sum
@@ -38,9 +39,7 @@ def refine_features(
     scale = map_scale(observations)
     observed = observations / scale
     count = observed.shape[1]
-    robust = torch.nn.functional.normalize(
-        least_squares.fit_lambertian(observed, light_directions), dim=-1
-    )
+    robust = normalize(least_squares.fit_lambertian(observed, light_directions), dim=-1)
     plain, change, noise = two_halves(observed, light_directions, signs)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.

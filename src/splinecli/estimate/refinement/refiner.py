@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.refine_net import (
@@ -48,6 +46,7 @@ from splinecli.estimate.refinement.tiles import (
     turned_part,
 )
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
+from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.observation_map import map_scale
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress, ignore
@@ -64,7 +63,6 @@ MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at 
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 
-Floats = NDArray[np.float32]
 Maps = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -72,11 +70,11 @@ Maps = tuple[torch.Tensor, torch.Tensor]
 class _Capture:
     """A capture to be refined, or a half of one."""
 
-    mask: NDArray[np.bool_]  # (H, W), with P true pixels
-    observations: Floats  # (P, F)
+    mask: Bools  # (H, W), with P true pixels
+    observations: Float32Array  # (P, F)
     lighting_at: LightingAt  # gives the light of some pixels
-    normals: Floats  # (P, 3), replaced, as are the errors (P, 2)
-    errors: Floats
+    normals: Float32Array  # (P, 3), replaced, as are the errors (P, 2)
+    errors: Float32Array
     reference: float  # reference, signs: of the whole capture; see refine_features
     signs: torch.Tensor
 
@@ -108,11 +106,11 @@ class NetworkRefiner:
     @torch.inference_mode()
     def refine(
         self,
-        mask: NDArray[np.bool_],
-        observations: Floats,
+        mask: Bools,
+        observations: Float32Array,
         lighting_at: LightingAt,
-        normals: Floats,
-        errors: Floats,
+        normals: Float32Array,
+        errors: Float32Array,
         *,
         progress: Progress = ignore,
     ) -> None:
@@ -157,7 +155,7 @@ class NetworkRefiner:
         ).numpy()  # NumPy takes ten times as long
         above = Band(slice(0, 0), *whole)
 
-        def refine(tile: Tile) -> tuple[PixelIndices, Floats, Floats]:
+        def refine(tile: Tile) -> tuple[PixelIndices, Float32Array, Float32Array]:
             inside = tile.mask[tile.inner]
             own = tile.rows[tile.inner][inside]
             seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
@@ -286,11 +284,11 @@ class NetworkRefiner:
     def _device(self) -> torch.device:
         return self.network.enter.weight.device
 
-    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+    def _tensor(self, values: Array) -> torch.Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self._device)
 
 
-def _turn_back(normals: Floats, rows: PixelIndices, lighting_at: LightingAt) -> None:
+def _turn_back(normals: Float32Array, rows: PixelIndices, lighting_at: LightingAt) -> None:
     """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in
     place.
     """
