@@ -60,9 +60,9 @@ def list_folder(folder: Path) -> list[Path]:
     """
     mode = find_mode(folder)
     if mode is None:
-        raise InputError("the folder does not exist", path=folder)
+        raise InputError("the folder does not exist", folder)
     if not stat.S_ISDIR(mode):
-        raise InputError("found a file, expected a folder of images", path=folder)
+        raise InputError("found a file, expected a folder of images", folder)
     with reading(folder, "folder"):
         return sorted(
             (entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key
@@ -119,8 +119,8 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images)
     )
     text = (
-        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
-        " same photographs, and"
+        f"{len(others)} files ({kinds}) have the names of other images ({used}):"
+        " they show the same photographs, and"
     )
     return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
@@ -134,11 +134,12 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
         found = ", ".join(
             f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2
         )
-        problem = "the folder contains no images" + (f", but {found}" if found else "")
-        hint = (
-            "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as images"
+        raise NoImagesError(
+            "the folder contains no images" + (f", but {found}" if found else ""),
+            folder,
+            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files"
+            " are read as images",
         )
-        raise NoImagesError(problem, path=folder, hint=hint)
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
@@ -156,21 +157,25 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         # Path.exists raises for a name that is too long
         image = next(filter(os.path.exists, places), None)
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            hint = "Copy the image into the folder, or set a link to it there, and name that"
             raise InputError(
-                f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint
+                f'the image "{name}" is outside of this folder',
+                path,
+                line=line,
+                hint="Copy the image into the folder, or set a link to it there, and name that",
             )
         if image is None:
-            hint = "Correct the name or remove the line"
-            raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
+            raise InputError(
+                f'the image "{name}" does not exist',
+                path,
+                line=line,
+                hint="Correct the name or remove the line",
+            )
         check_file(image, "an image")
         if image in images:
-            raise InputError(
-                f'the image "{name}" is also on line {images[image]}', path=path, line=line
-            )
+            raise InputError(f'the image "{name}" is also on line {images[image]}', path, line=line)
         images[image] = line
     if not images:
-        raise InputError("the list names no images", path=path)
+        raise InputError("the list names no images", path)
     return tuple(images)
 
 
@@ -322,13 +327,13 @@ def choose_mask(
     text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
     if masks[0] in images:
         text = (
-            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
-            " another one."
+            f"The alpha channel of {masks[0].name} is used as the mask."
+            " Give --mask FILE for another one."
         )
     if len(masks) > 1:
         text = (
-            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
-            " --mask FILE."
+            f"{', '.join(path.name for path in masks)}: none is used as the mask."
+            " Choose one with --mask FILE."
         )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 

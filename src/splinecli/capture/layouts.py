@@ -43,18 +43,22 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         return None
     if not captures:
         expected = f"{_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse"
-        raise InputError(f"found no folder of images, expected {expected}", path=folder)
+        raise InputError(f"found no folder of images, expected {expected}", folder)
     images_folder, *more = captures
     if more:
         names = ", ".join(path.name for path in captures)
-        problem = f"found {len(captures)} folders of images ({names}), expected one"
-        raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
+        raise InputError(
+            f"found {len(captures)} folders of images ({names}), expected one",
+            folder,
+            hint=f"Give one of them, such as {images_folder}",
+        )
     holder = _parent(images_folder)
     lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
-        problem = f"found no light.txt, expected the light directions of {images_folder.name}"
         raise InputError(
-            problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image"
+            f"found no light.txt, expected the light directions of {images_folder.name}",
+            holder,
+            hint="Pass --lights FILE, with one line x y z for each image",
         )
     images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
     # The object is the union of both masks, so one alone would be wrong.
@@ -62,10 +66,11 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
     )
     if missing := [name for name, path in masks.items() if path is None]:
-        problem = (
-            f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(
+            f"found no {' and no '.join(missing)}, expected the masks whose union is the object",
+            holder,
+            hint="Pass --mask FILE",
         )
-        raise InputError(problem, path=holder, hint="Pass --mask FILE")
     return files.CaptureFiles(
         "CyclesPS",
         _name(images_folder),
@@ -132,10 +137,10 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
     expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
     for name in wanted:
         if name not in there:
-            raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
+            raise InputError(f"the image does not exist, expected {expected}", folder / name)
     n_images = sum(bool(re.fullmatch(r"\d{5}\.tif", name)) for name in there)
     if n_images != n_lights:
-        raise InputError(f"found {n_images} images, expected {expected}", path=folder)
+        raise InputError(f"found {n_images} images, expected {expected}", folder)
     return tuple(there[name] for name in wanted)
 
 
@@ -172,8 +177,11 @@ def find_capture_files(
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
             raise
-        hint = f"There are captures in {folder}, such as {captures[0]}: give these"
-        raise InputError(error.problem, path=folder, hint=hint) from None
+        raise InputError(
+            error.problem,
+            folder,
+            hint=f"There are captures in {folder}, such as {captures[0]}: give these",
+        ) from None
 
 
 def capture_name(folder: StrPath) -> str:
@@ -230,9 +238,11 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    problem = f"found no capture, expected folders of images with a light file ({light_names()})"
-    hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
-    raise InputError(problem, path=folder, hint=hint)
+    raise InputError(
+        f"found no capture, expected folders of images with a light file ({light_names()})",
+        folder,
+        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
+    )
 
 
 def _subfolders(folder: Path) -> list[Path]:
@@ -288,13 +298,15 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = (
-            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
-            " the file from images"
-            " of a mirror ball. Without one, --lights estimate finds them from the images, with"
-            " lower accuracy"
+            "Pass --lights FILE, with one line x y z for each image."
+            " 'splinecli calibrate' makes the file from images of a mirror ball. Without one,"
+            " --lights estimate finds them from the images, with lower accuracy"
         )
-        problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
-        raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)
+        raise InputError(
+            f"the folder contains {len(images)} images but no light file ({light_names()})",
+            folder,
+            hint=f"Add {option}" if option else hint,
+        )
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.

@@ -144,8 +144,11 @@ def find_lights(folder: Path) -> Path | None:
             if fnmatchcase(e.name.lower(), name) and is_found_file(e)
         ]
         if rank and len(paths) > 1:
-            problem = f"found {len(paths)} light files: {', '.join(path.name for path in paths)}"
-            raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
+            raise InputError(
+                f"found {len(paths)} light files: {', '.join(path.name for path in paths)}",
+                folder,
+                hint="Choose one with --lights FILE",
+            )
         if paths:
             return paths[0]
     return find_named(folder, LIGHT_POSITIONS)
@@ -219,9 +222,12 @@ def read_light_positions(
     table = format_of(path).read(path, n_images, "positions")
     positions, _ = lights_of(table, n_images, frame, "positions")
     if table.names is not None:
-        problem = f"found the name {table.names[0]!r}, expected x y z"
-        hint = "Positions have a line for each image, in the order of the images"
-        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(
+            f"found the name {table.names[0]!r}, expected x y z",
+            table.path,
+            line=table.rows[0].line,
+            hint="Positions have a line for each image, in the order of the images",
+        )
     return positions
 
 
@@ -296,19 +302,24 @@ def unit_directions(
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            problem = (
-                f"found a zero vector{place}, expected a"
-                f" {'lamp position' if lamps else 'light direction'}"
+            raise InputError(
+                f"found a zero vector{place},"
+                f" expected a {'lamp position' if lamps else 'light direction'}",
+                path,
+                line=line,
+                hint="Write x y z towards the light, or remove the line and its image",
             )
-            hint = "Write x y z towards the light, or remove the line and its image"
-            raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
             what = "lamp behind the object" if lamps else "light below the horizon"
             hint = "z points to the camera; the file may be in another frame"
             if (directions[:, 2] < 0).all():
                 hint = "z points away from the camera in this file: add --light-frame z-away"
-            problem = f"found a {what}{place} (z = {vector[2]:g}), expected z > 0"
-            raise InputError(problem, path=path, line=line, hint=hint)
+            raise InputError(
+                f"found a {what}{place} (z = {vector[2]:g}), expected z > 0",
+                path,
+                line=line,
+                hint=hint,
+            )
     return directions
 
 
@@ -327,8 +338,11 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
         value, line = intensities[light, channel], table.rows[channel if transposed else light].line
         place = f" in column {light + 1}" if transposed else ""
         expected = "above 0" if value <= 0 else light_rows.INTENSITIES
-        problem = f"found the intensity {value:g}{place}, expected a number {expected}"
-        raise InputError(problem, path=table.path, line=line)
+        raise InputError(
+            f"found the intensity {value:g}{place}, expected a number {expected}",
+            table.path,
+            line=line,
+        )
     return np.broadcast_to(intensities, (n_images, 3)).copy()
 
 
@@ -359,11 +373,13 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if not count.is_integer():
         expected = numbers.columns(len(following[0].numbers))
         raise InputError(
-            f"found 1 column, expected {expected} or a count", path=table.path, line=first.line
+            f"found 1 column, expected {expected} or a count", table.path, line=first.line
         )
-    problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
     raise InputError(
-        problem, path=table.path, line=first.line, hint="Correct the count or leave it out"
+        f"the count line says {count:.0f}, but {len(following)} rows follow",
+        table.path,
+        line=first.line,
+        hint="Correct the count or leave it out",
     )
 
 
@@ -386,9 +402,12 @@ def _one_light_a_row(
         decimal_commas = n_columns > 3 and (
             numbers.has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
         )
-        problem = f"found {numbers.columns(n_columns)}, expected {expected}"
-        hint = numbers.DECIMAL_POINT if decimal_commas else None
-        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(
+            f"found {numbers.columns(n_columns)}, expected {expected}",
+            table.path,
+            line=table.rows[0].line,
+            hint=numbers.DECIMAL_POINT if decimal_commas else None,
+        )
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
@@ -400,7 +419,7 @@ def _one_light_a_row(
     )
     problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
-    error = WrongCountError(problem, path=table.path, hint=hint)
+    error = WrongCountError(problem, table.path, hint=hint)
     error.n_found = count
     raise error
 
@@ -421,9 +440,7 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
     seen = set()
     for name, row in zip(names, table.rows, strict=True):
         if name.casefold() in seen:
-            raise InputError(
-                f'a second light for the image "{name}"', path=table.path, line=row.line
-            )
+            raise InputError(f'a second light for the image "{name}"', table.path, line=row.line)
         seen.add(name.casefold())
     for how, part in (("name", "name"), ("name without suffix", "stem")):
         by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
@@ -435,9 +452,12 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
     present = {image.name.casefold() for image in images}
     missing = next((i for i, name in enumerate(names) if name.casefold() not in present), 0)
     problem = f"found {len(names)} lights but {len(images)} images; the image"
-    hint = "Correct the names in the file, or give as many images as lights, in the same order"
-    problem = f'{problem} "{names[missing]}" is not among them'
-    raise InputError(problem, path=table.path, line=table.rows[missing].line, hint=hint)
+    raise InputError(
+        f'{problem} "{names[missing]}" is not among them',
+        table.path,
+        line=table.rows[missing].line,
+        hint="Correct the names in the file, or give as many images as lights, in the same order",
+    )
 
 
 def read_lights(
@@ -464,9 +484,9 @@ def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes
             ".txt",
             *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes),
         )
-        hint = f"Write {', '.join(most)} or {last}"
         raise UsageError(
-            f"{path}: light files of the type {path.suffix.lower()} are only read", hint=hint
+            f"{path}: light files of the type {path.suffix.lower()} are only read",
+            hint=f"Write {', '.join(most)} or {last}",
         )
     return encode
 

@@ -35,31 +35,29 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
-        raise InputError(
-            "the file is empty, expected the number of lights on the first line", path=path
-        )
+        raise InputError("the file is empty, expected the number of lights on the first line", path)
     (first, count), *rows = content
     words = count.split()
     if len(words) > 3 and None not in map(to_number, words[-3:]):
         rows = content
     elif not count.isdecimal():
-        raise InputError(
-            f'found "{count[:40]}", expected the number of lights', path=path, line=first
-        )
+        raise InputError(f'found "{count[:40]}", expected the number of lights', path, line=first)
     elif int(count[:9]) != len(rows):
-        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
         raise InputError(
-            problem, path=path, line=first, hint="Correct the number, or restore the missing lines"
+            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
+            path,
+            line=first,
+            hint="Correct the number, or restore the missing lines",
         )
     if not rows:
-        raise InputError("the file contains no lights", path=path, line=first)
+        raise InputError("the file contains no lights", path, line=first)
     names, vectors = [], []
     commas = numbers.uses_decimal_commas([text for _, text in rows], 3)
     for line, text in rows:
         words = text.rsplit(maxsplit=3)
         if len(words) < 4:
             raise InputError(
-                f'found "{text[:40]}", expected a file name and x y z', path=path, line=line
+                f'found "{text[:40]}", expected a file name and x y z', path, line=line
             )
         names.append(image_name(words[0], []))
         words = numbers.split_words(" ".join(words[1:]), decimal_commas=commas)[:3]
@@ -76,9 +74,9 @@ def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     try:
         document = parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+        raise InputError(f"is not JSON ({error.msg})", path, line=error.lineno) from None
     except ValueError as error:
-        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
+        raise InputError(f"cannot be read as JSON ({error})", path) from None
     named = isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
     if named or path.suffix.lower() == ".dome":
         return _read_dome(document, path, form)
@@ -101,26 +99,30 @@ class _Light(Struct):
 def _read_alicevision(document: Any, path: Path) -> NumberRows:
     listed = document.get("lights") if isinstance(document, dict) else None
     if not isinstance(listed, list) or not listed:
-        problem = (
-            'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
+        raise InputError(
+            'found no list "lights", expected lights as AliceVision writes them,'
+            " or a list of x y z",
+            path,
         )
-        raise InputError(problem, path=path)
     names, vectors, intensities = [], [], []
     for number, values in enumerate(listed, start=1):
         try:
             light = convert(values, _Light)
         except ValidationError as error:
-            hint = "Calibrate for distant lights, with one direction for each light"
-            raise InputError(f"light {number}: {error}", path=path, hint=hint) from None
+            raise InputError(
+                f"light {number}: {error}",
+                path,
+                hint="Calibrate for distant lights, with one direction for each light",
+            ) from None
         names.append(image_name(str(number if light.view is None else light.view), []))
         x, y, z = light.direction
         vectors.append((x, -y, -z))
         intensities += [] if light.intensity is None else [light.intensity]
     if intensities and len(intensities) != len(listed):
-        problem = (
-            f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none"
+        raise InputError(
+            f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none",
+            path,
         )
-        raise InputError(problem, path=path)
     return _unnumbered(path, vectors, names, intensities)
 
 
@@ -135,7 +137,7 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     gives intensities.
     """
     if not isinstance(document, dict):
-        raise InputError("found no object, expected a dome as Relight writes it", path=path)
+        raise InputError("found no object, expected a dome as Relight writes it", path)
     positions = _DOME_POSITIONS
     if document.get("lightConfiguration") == "spherical":
         positions = ("positionsSphere", "positions3d", "positions")
@@ -143,19 +145,19 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     key = next((key for key in keys if document.get(key)), None)
     if key is None:
         raise InputError(
-            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path
+            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path
         )
     vectors, factors = (
         _vectors(document[key], "xyz"),
         _vectors(document.get("ledAdjust"), "rgb") or [],
     )
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
+        raise InputError(f'the list "{key}" does not have x, y and z for each light', path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
         raise InputError(
-            problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path=path
+            problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path
         )
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
@@ -237,11 +239,11 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
         or not array.size
         or not np.isfinite(array).all()
     ):
-        problem = (
-            f"found an array of shape {array.shape} and type {array.dtype}, expected finite"
-            " numbers N x 3"
+        raise InputError(
+            f"found an array of shape {array.shape} and type {array.dtype},"
+            " expected finite numbers N x 3",
+            path,
         )
-        raise InputError(problem, path=path)
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
     return NumberRows(path, tuple(Row(tuple(row), line) for line, row in rows))
 
@@ -260,12 +262,12 @@ def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | No
     sizes = ", ".join(
         f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items()
     )
-    problem = (
+    raise InputError(
         f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
-        f" N{f': {sizes}' if sizes else ''}"
+        f" N{f': {sizes}' if sizes else ''}",
+        path,
+        hint="Write the light directions into a text file, a line x y z for each image",
     )
-    hint = "Write the light directions into a text file, a line x y z for each image"
-    raise InputError(problem, path=path, hint=hint)
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
@@ -273,10 +275,10 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
         with path.open("rb") as file:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
     except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"the file cannot be read ({error.strerror})", path) from None
     except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
         raise InputError(
-            "the .npy file is damaged, or contains no array of numbers", path=path
+            "the .npy file is damaged, or contains no array of numbers", path
         ) from None
 
 
@@ -291,6 +293,8 @@ def _read_opencv(path: Path) -> dict[str, Float64Array]:
             values = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
             found[name] = values.reshape(int(rows), int(columns))
         except ValueError:
-            problem = f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}"
-            raise InputError(problem, path=path) from None
+            raise InputError(
+                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}",
+                path,
+            ) from None
     return found

@@ -165,25 +165,24 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
             if form == "slant-tilt":
                 problem = (
-                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
-                    " to 360 degrees"
+                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to"
+                    " 360 degrees"
                 )
                 hint = "The slant counts from the camera axis"
             else:
                 problem = (
-                    f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
-                    " above 0 to 90"
+                    f"found azimuth {first:g} and elevation {second:g},"
+                    " expected -360 to 360 and above 0 to 90"
                 )
                 problem += " degrees"
                 hint = (
                     "The elevation counts from the image plane: 90 is the direction of the camera"
                 )
-            raise InputError(problem, path=table.path, line=row.line, hint=hint)
+            raise InputError(problem, table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
-        problem = "no angle is above 2 pi, so they look like radians, expected degrees"
         raise InputError(
-            problem,
-            path=table.path,
+            "no angle is above 2 pi, so they look like radians, expected degrees",
+            table.path,
             line=table.rows[0].line,
             hint="Multiply them by 180 / pi = 57.2958",
         )
@@ -215,8 +214,8 @@ def refuse_angles(table: NumberRows) -> None:
     found, hint = "", AZEL_HINT
     if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
         found = (
-            f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3"
-            " columns (x y z)"
+            f"{'a number and two angles' if numbered else '2 columns of angles'},"
+            " expected 3 columns (x y z)"
         )
     elif (
         lengths == {3} and not numbered
@@ -229,7 +228,7 @@ def refuse_angles(table: NumberRows) -> None:
                 f"Leave the third column out. {hint}",
             )
     if found:
-        raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(f"found {found}", table.path, line=table.rows[0].line, hint=hint)
 
 
 def counts_rows(column: list[float]) -> int | None:
@@ -269,9 +268,12 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
         zenith = ("zen", "polar", "incl", "colat", "coelev")
         found = next((word for word in header if word.lower().startswith(zenith)), None)
         if found is not None and n_numbers == len(_ANGLES):
-            problem = f'found the column "{found[:40]}", expected azimuth and elevation'
-            hint = "The elevation is 90 minus the angle from the camera axis"
-            raise InputError(problem, path=path, line=line, hint=hint)
+            raise InputError(
+                f'found the column "{found[:40]}", expected azimuth and elevation',
+                path,
+                line=line,
+                hint="The elevation is 90 minus the angle from the camera axis",
+            )
     # A count may precede rows with names.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
     if body and all(to_number(words[0]) is None for *_, words in body):
@@ -283,8 +285,12 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
         if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [
             len(_ANGLES)
         ]:
-            problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
-            raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
+            raise InputError(
+                "found a name and 2 numbers, expected a name and 3 (x y z)",
+                path,
+                line=body[0][0],
+                hint=AZEL_HINT,
+            )
     return _reordered(parse_rows(rows, path), order)
 
 

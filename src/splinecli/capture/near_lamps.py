@@ -191,9 +191,8 @@ def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
 
 
 UNIT_HINT = (
-    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the"
-    " pixel size or object"
-    " width"
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance,"
+    " and the pixel size or object width"
 )
 
 
@@ -207,11 +206,11 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
     text = (
-        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is"
-        f" {sizes[0]:.3g} wide"
+        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object,"
+        f" which is {sizes[0]:.3g} wide"
     )
     if distances[nearest] < 0.5 * min(sizes):
-        raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
+        raise InputError(f"{text}: it would be inside the object", positions, hint=UNIT_HINT)
     if distances[nearest] < max(sizes):
         return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
     # A position in metres instead of millimetres changes the distance a thousandfold.
@@ -236,18 +235,17 @@ def distant_lights(
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
         text = (
-            f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or"
-            " --object-width."
+            f"{name} is not used, because the size of a pixel is unknown."
+            " Give --pixel-size or --object-width."
         )
         return [CaptureWarning(NEAR_LAMPS, text)]
     angle_deg = lamps.angles_across_deg(mask).max()
     if angle_deg <= 2.0:
         return []
     text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f}"
-        " degrees between the middle"
-        " and the edge of the object, but the lights are treated as distant. Use --light-positions"
-        " instead of --lights."
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees"
+        " between the middle and the edge of the object, but the lights are treated as distant."
+        " Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -268,8 +266,8 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
         return []
     text = (
         f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g},"
-        " as positions of"
-        " lamps have, but are read as directions. If they are positions, use --light-positions."
+        " as positions of lamps have, but are read as directions. If they are positions,"
+        " use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -365,7 +363,7 @@ class LampFiles:
             positions = source.light_directions * self.distance
         # float32 holds the squares of distances up to 1e19.
         if (farthest := np.abs(positions).max(initial=0)) > 1e15:
-            raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
+            raise InputError(f"a lamp is {farthest:.3g} away", self.positions, hint=UNIT_HINT)
         pixel_size = self.pixel_size
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
@@ -406,11 +404,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             positions = find_named(lights.parent, LIGHT_POSITIONS)
     if positions is None and options.distance is None:
         if options.given is not None:
-            problem = (
-                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
-            )
             raise UsageError(
-                problem, hint="Add --light-positions FILE or --light-distance D, or leave it out"
+                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
+                hint="Add --light-positions FILE or --light-distance D, or leave it out",
             )
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
@@ -423,10 +419,12 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     )
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
-        hint = (
-            "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+        raise InputError(
+            "the scale of the lamp positions is unknown",
+            positions,
+            hint="Give --pixel-size or --object-width,"
+            " or write the width of a pixel into pixel_size.txt",
         )
-        raise InputError("the scale of the lamp positions is unknown", path=positions, hint=hint)
     return LampFiles(
         positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled
     )
@@ -459,10 +457,9 @@ def read_camera_matrix(path: Path) -> Float64Array:
     """Return the camera matrix (3, 3) of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
-        problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
         raise InputError(
-            problem,
-            path=path,
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
+            path,
             hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
         )
     ray_basis(matrix)  # rejects other numbers
@@ -477,26 +474,23 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
         raise InputError(
-            f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint
+            f"found {len(rows)} lines, expected 1 or {len(positions)}", path, hint=hint
         )
     for numbers, line, text in rows:
         # With an exponent of 100, the intensity halves 7 degrees off the axis.
         if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= 100:
-            raise InputError(
-                f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint
-            )
+            raise InputError(f'found "{text[:60]}", expected x y z mu', path, line=line, hint=hint)
     rows *= len(positions) // len(rows)
     lobes = np.array([row.numbers for row in rows])
     lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
     away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
     if away.any():
         lamp = int(away.argmax())
-        hint = "The directions point from the lamps to the object"
         raise InputError(
             f"lamp {lamp + 1} shines away from the object",
-            path=path,
+            path,
             line=rows[lamp].line,
-            hint=hint,
+            hint="The directions point from the lamps to the object",
         )
     return lobes
 
@@ -508,9 +502,12 @@ def _read_pixel_size(path: Path) -> float:
     line, text = content[0]
     size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
-        problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
-        hint = "Write the number alone; its unit is the unit of the lamps' positions"
-        raise InputError(problem, path=path, line=line, hint=hint)
+        raise InputError(
+            f'found "{text[:40]}", expected one number above 0, the width of a pixel',
+            path,
+            line=line,
+            hint="Write the number alone; its unit is the unit of the lamps' positions",
+        )
     return size
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # The message for each extra
 _PROBLEMS = {
-    "cluster": "--workers above 1 and --cluster need the package distributed, which is"
-    " not installed",
+    "cluster": "--workers above 1 and --cluster need the package distributed,"
+    " which is not installed",
     "exr": "EXR files need the package OpenEXR, which is not installed",
     "heif": "HEIC images need the package pillow-heif, which is not installed",
     "mesh": "--decimate needs the package fast-simplification, which is not installed",
@@ -50,7 +50,7 @@ def import_extra(
     except ImportError as cause:
         alternative = f", or {otherwise}" if otherwise else ""
         raise error(
-            _PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
+            _PROBLEMS[extra], path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
         ) from cause
 
 

@@ -70,11 +70,11 @@ def read_tensors(
     """
     try:
         if path.is_dir():
-            raise ModelError("is a folder", path=path, hint=hint)
+            raise ModelError("is a folder", path, hint=hint)
         if is_special(path):
-            raise ModelError("is not a file", path=path, hint=hint)
+            raise ModelError("is not a file", path, hint=hint)
         if not path.is_file():
-            raise ModelError("no such file", path=path, hint=hint)
+            raise ModelError("no such file", path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
             if (
@@ -85,16 +85,19 @@ def read_tensors(
                 metadata = file.metadata() or {}
                 found = metadata.get("format", "none")
                 if found != expected_format:
-                    problem = f"wrong format: found {found}, expected {expected_format}"
-                    raise ModelError(problem, path=path, hint=hint)
+                    raise ModelError(
+                        f"wrong format: found {found}, expected {expected_format}",
+                        path,
+                        hint=hint,
+                    )
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
         raise ModelError(
-            f"not a safetensors file, or cut short ({error})", path=path, hint=hint
+            f"not a safetensors file, or cut short ({error})", path, hint=hint
         ) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError(
-            "damaged: the tensors do not match the checksum in the file", path=path, hint=hint
+            "damaged: the tensors do not match the checksum in the file", path, hint=hint
         )
     return tensors, metadata
 
@@ -103,7 +106,7 @@ def check_length(path: Path, hint: str) -> None:
     """Raise ModelError for a file of more than LONGEST bytes."""
     if (length := path.stat().st_size) > LONGEST:
         found = f"found {length / 1e6:.0f} MB, expected at most {LONGEST / 1e6:.0f}"
-        raise ModelError(found, path=path, hint=hint)
+        raise ModelError(found, path, hint=hint)
 
 
 def read_json_entry(
@@ -118,7 +121,7 @@ def read_json_entry(
         return parse_json(metadata.get(key, ""), kind)
     except ValueError as error:
         raise ModelError(
-            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path=path
+            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path
         ) from error
 
 
@@ -130,9 +133,7 @@ def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) ->
         network.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise ModelError(
-            f"the tensors do not fit the configuration ({reason})", path=path
-        ) from error
+        raise ModelError(f"the tensors do not fit the configuration ({reason})", path) from error
 
 
 def load_shipped(module: Module, entry: dict[str, str], expected_format: str) -> Module:

@@ -44,11 +44,11 @@ def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> 
     except SplinecliError:
         raise
     except PermissionError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"the file cannot be read ({error.strerror})", path) from None
     except Exception as error:
         if is_out_of_memory(error):
             raise
-        raise InputError(problem, path=path, hint=hint) from error
+        raise InputError(problem, path, hint=hint) from error
 
 
 _STDERR_LOCK = threading.Lock()
@@ -117,13 +117,14 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
         size = os.fstat(file.fileno()).st_size
         parts = zip(page.dataoffsets, page.databytecounts, strict=True)
         if any(count == 0 or offset + count > size for offset, count in parts):
-            raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
+            raise InputError("the TIFF is truncated", path, hint=COPY_AGAIN)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-            problem = (
-                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            raise InputError(
+                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
+                path,
+                hint="Export it as RGB",
             )
-            raise InputError(problem, path=path, hint="Export it as RGB")
         pixels = _decode_page(page)
         if photometric == _WHITE_IS_ZERO:
             if pixels is None:
@@ -334,5 +335,8 @@ def _libraw(path: Path) -> Iterator[ModuleType]:
     try:
         yield rawpy
     except (rawpy.LibRawError, OSError):
-        problem = "the RAW file is damaged or of a camera that LibRaw does not know"
-        raise InputError(problem, path=path, hint=f"Copy it again, or {otherwise}") from None
+        raise InputError(
+            "the RAW file is damaged or of a camera that LibRaw does not know",
+            path,
+            hint=f"Copy it again, or {otherwise}",
+        ) from None

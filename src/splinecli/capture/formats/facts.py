@@ -112,9 +112,7 @@ class ImageHeader:
         if self.kind == "RAW":
             return decoders.raw_size(self.path)
         if self.stated_size is None:
-            raise InputError(
-                f"the {self.kind} is truncated", path=self.path, hint=decoders.COPY_AGAIN
-            )
+            raise InputError(f"the {self.kind} is truncated", self.path, hint=decoders.COPY_AGAIN)
         return self.stated_size
 
 
@@ -138,7 +136,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         start, suffix = file.read(12), path.suffix.lower()
         file.seek(0)
         if not start:
-            raise InputError("the file is empty", path=path)
+            raise InputError("the file is empty", path)
         otherwise = "TGA" if suffix == ".tga" else None  # TGA files have no signature
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
@@ -146,7 +144,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         kind = "RAW" if suffix in decoders.RAW_SUFFIXES else found
         if kind is None:
             raise InputError(
-                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path
+                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path
             )
         yield file, kind
 
@@ -405,10 +403,11 @@ def check_exposures(images: Sequence[ImageHeader]) -> None:
                 "Expose all images alike, or give each image's exposure as the intensity of its"
                 " light"
             )
-            problem = (
-                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
+            raise InputError(
+                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
+                facts.path,
+                hint=f"{hint} (--intensities FILE)",
             )
-            raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
 
 
 def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] | None:
@@ -457,11 +456,10 @@ def common_orientation(images: Sequence[ImageHeader]) -> int:
     orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
-            problem = (
-                f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
-                f" {asked[0].path.name}"
-            )
             raise InputError(
-                problem, path=facts.path, hint="Export all images the same way up, without this tag"
+                f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
+                f" {asked[0].path.name}",
+                facts.path,
+                hint="Export all images the same way up, without this tag",
             )
     return orientations[0] if orientations else UPRIGHT

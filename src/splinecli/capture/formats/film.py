@@ -73,11 +73,12 @@ def choose_frames(film: Path) -> tuple[int, ...]:
             f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their"
             " light, expected"
         )
-        hint = (
-            "Film from a tripod while the lamp moves all around the object, with focus and"
-            " exposure locked"
+        raise InputError(
+            f"{problem} at least {FEWEST_FRAMES}",
+            film,
+            hint="Film from a tripod while the lamp moves all around the object,"
+            " with focus and exposure locked",
         )
-        raise InputError(f"{problem} at least {FEWEST_FRAMES}", path=film, hint=hint)
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
@@ -117,8 +118,11 @@ def _candidates(film: Path) -> list[_Candidate]:
         if not found:
             raise ValueError
     if number < 0.8 * stated:
-        problem = f"the film breaks off: {number} of {stated:.0f} frames can be read"
-        raise InputError(problem, path=film, hint="Copy it again")
+        raise InputError(
+            f"the film breaks off: {number} of {stated:.0f} frames can be read",
+            film,
+            hint="Copy it again",
+        )
     return found
 
 
@@ -176,7 +180,7 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
         if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
             raise InputError(
                 "found no film",
-                path=film,
+                film,
                 hint="MP4, MOV, AVI, MKV and WebM files are read as films",
             )
         file.seek(0)

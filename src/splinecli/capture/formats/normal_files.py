@@ -91,11 +91,11 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp"):
-        problem = (
+        raise InputError(
             f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or'
-            " .bmp"
+            " .bmp",
+            path,
         )
-        raise InputError(problem, path=path)
     if suffix != ".txt":
         stored = _read_vectors(
             path, images.ExpectedSize(mask.shape, "the images", "a ground truth")
@@ -149,7 +149,7 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
         problem = (
             f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {height * width} rows of 3,"
         )
-        raise InputError(f"{problem} one for each pixel of {height} x {width}", path=path)
+        raise InputError(f"{problem} one for each pixel of {height} x {width}", path)
     return rows.reshape(height, width, 3)
 
 
@@ -163,7 +163,7 @@ def _to_normals(
     """
     values = stored.values
     if values.dtype.kind not in "fiu":
-        raise InputError(f"found normals of type {values.dtype}, expected real numbers", path=path)
+        raise InputError(f"found normals of type {values.dtype}, expected real numbers", path)
     if stored.is_picture or check_floats:
         _check_lengths(values, mask, path)
     normals = np.zeros(values.shape, np.float32)
@@ -178,7 +178,7 @@ def _to_normals(
                 np.where((np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True), vectors, 0)
             )
     if not normals.any():
-        raise InputError("found no normal inside the mask, expected at least one", path=path)
+        raise InputError("found no normal inside the mask, expected at least one", path)
     return normals
 
 
@@ -199,11 +199,14 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
         problem = (
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2"
-            " - 1), expected"
+            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 -"
+            " 1), expected"
         )
-        hint = "If the background is not black, give a mask"
-        raise InputError(f"{problem} nearly all: these are not normals", path=path, hint=hint)
+        raise InputError(
+            f"{problem} nearly all: these are not normals",
+            path,
+            hint="If the background is not black, give a mask",
+        )
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
@@ -226,9 +229,10 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
         found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
-        problem = f"found an array of {found}, expected floating-point numbers H x W"
         raise InputError(
-            problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR"
+            f"found an array of {found}, expected floating-point numbers H x W",
+            path,
+            hint="Save the depth as .npy, floating-point TIFF or EXR",
         )
     depth = np.array(stored, np.float64)
     depth[~np.isfinite(depth)] = np.nan
@@ -249,7 +253,7 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
-        raise InputError("the EXR file is damaged and cannot be read", path=path)
+        raise InputError("the EXR file is damaged and cannot be read", path)
     for name in (
         "Z",
         "Y",
@@ -262,4 +266,4 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
     ):  # names of a depth, then any other
         if name in channels:
             return np.asarray(channels[name].pixels)
-    raise InputError("the EXR file has no channel", path=path)
+    raise InputError("the EXR file has no channel", path)

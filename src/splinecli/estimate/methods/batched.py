@@ -245,8 +245,8 @@ class NetworkEstimator(Estimator):
             self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
             self.fingerprint += (
-                f", without indirect light, refined in {self.refiner.turns} turns, halved, with"
-                " detail"
+                f", without indirect light, refined in {self.refiner.turns} turns, halved,"
+                " with detail"
             )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._contexts: list[CaptureContext | None] = [

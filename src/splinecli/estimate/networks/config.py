@@ -113,8 +113,8 @@ class NetworkConfig:
         for fit in config.fits:
             if fit not in STARTING_FITS:
                 raise ModelError(
-                    f"network setting 'fits' has {fit!r}; expected a list of"
-                    f" {', '.join(STARTING_FITS)}"
+                    f"network setting 'fits' has {fit!r};"
+                    f" expected a list of {', '.join(STARTING_FITS)}"
                 )
         for name in ("fits", "error_head", "set_width"):
             if getattr(config, name) and config.size != "compact":
@@ -127,8 +127,8 @@ class NetworkConfig:
             raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
         if config.set_width % HEAD_WIDTH:
             raise ModelError(
-                f"network setting 'set_width' is {config.set_width}; expected a multiple of"
-                f" {HEAD_WIDTH}"
+                f"network setting 'set_width' is {config.set_width};"
+                f" expected a multiple of {HEAD_WIDTH}"
             )
         if config.grid != "even" and config.size != "paper":
             raise ModelError(

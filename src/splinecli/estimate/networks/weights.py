@@ -64,7 +64,7 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
-            raise ModelError(f"tensor {key!r} has values that are not finite", path=path)
+            raise ModelError(f"tensor {key!r} has values that are not finite", path)
     network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LoadedNetwork(network, name or path.stem, file_sha256(path))
 
@@ -107,8 +107,8 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
             raise ModelError(
-                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors"
-                " file"
+                f"no weights named {name_or_file!r}; expected one of {names},"
+                " or a .safetensors file"
             )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:
