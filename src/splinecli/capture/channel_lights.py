@@ -55,16 +55,14 @@ class ChannelLights:
     def in_words(self) -> str:
         text = (
             "The channels R, G, B of each image are read as photographs under three lamps."
-            " This is only valid for"
+            " This is only valid for gray objects; coloured objects get wrong normals."
         )
-        text += " gray objects; coloured objects get wrong normals."
-        if not self.measured:
-            text += (
-                f" Without {CROSSTALK}, each channel is assumed to respond to its own lamp only;"
-                " measure the"
-            )
-            text += " crosstalk with calibrate --gray-ball DIR --lights-in-channels."
-        return text
+        if self.measured:
+            return text
+        return (
+            f"{text} Without {CROSSTALK}, each channel is assumed to respond to its own lamp only;"
+            " measure the crosstalk with calibrate --gray-ball DIR --lights-in-channels."
+        )
 
 
 def check_crosstalk(matrix: Float64Array, path: Path) -> None:

@@ -273,7 +273,7 @@ def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | No
 def _read_npy(path: Path) -> NDArray[np.generic]:
     try:
         with path.open("rb") as file:
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+            return np.lib.format.read_array(file, allow_pickle=False)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path) from None
     except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways

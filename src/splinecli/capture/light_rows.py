@@ -54,7 +54,7 @@ class LightFrame:
         camera.
         """
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
-        return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
+        return np.diag(self.signs).astype(np.float64)[:, order]
 
     def __str__(self) -> str:
         """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual
@@ -199,7 +199,7 @@ def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
     """Return the lights (..., 3) that a mirror with these unit normals reflects towards the
     camera.
     """
-    return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
+    return 2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0)
 
 
 def refuse_angles(table: NumberRows) -> None:

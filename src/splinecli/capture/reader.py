@@ -120,7 +120,7 @@ def open_capture(
                 problem, hint="Leave it out, or use --light-distance with a file of directions"
             )
         overrides, form = replace(overrides, lights=near.positions), "positions"
-    if near is not None and near.object_width is not None and window.box is not None:
+    if near is not None and near.options.object_width is not None and window.box is not None:
         raise UsageError(
             "--object-width needs the whole object in the image",
             hint="Give --pixel-size beside --crop",

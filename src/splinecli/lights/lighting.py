@@ -25,7 +25,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
-from splinecli.maths.pixel_grid import Blocks, focal_length, ray_basis, rays_at
+from splinecli.maths.pixel_grid import Blocks, focal_length, on_map, ray_basis, rays_at
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import side_by_side
 
@@ -124,7 +124,7 @@ def _camera_position(lamps: NearLamps) -> Floats:
     assert lamps.camera_matrix is not None
     row, column = lamps.middle
     middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
-    return np.asarray(-middle * _plane_distance(lamps))
+    return -middle * _plane_distance(lamps)
 
 
 def _turns_to_view(views: Floats) -> Floats:
@@ -246,9 +246,7 @@ def _exchange(
     Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask
     covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
-    normal_map = np.zeros((*blocks.mask.shape, 3))
-    normal_map[blocks.mask] = normals
-    heights = integrate_normals(normal_map, blocks.mask)[blocks.mask]
+    heights = integrate_normals(on_map(normals, blocks.mask), blocks.mask)[blocks.mask]
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)

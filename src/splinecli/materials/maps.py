@@ -29,6 +29,7 @@ from splinecli.materials.lobes import (
 )
 from splinecli.materials.material_net import Gloss
 from splinecli.maths import Bools, Float32Array, Floats
+from splinecli.maths.pixel_grid import on_map
 from splinecli.records.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
@@ -108,12 +109,10 @@ def estimate_material(
         InputError: there are too few lights.
     """
     MAPS["material"].check_lights(len(lights))
-    normal_map = np.zeros((*mask.shape, 3), np.float32)
-    normal_map[mask] = normals
     pixels = _Pixels(
         normals,
         _normal_error(normals, normal_confidence),
-        lights_that_reach(normal_map, mask, lights),
+        lights_that_reach(on_map(normals, mask), mask, lights),
         lighting_at,
     )
     bright, white = pixels.brightness()
@@ -194,7 +193,7 @@ def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
     heights = integrate_normals(normal_map[::step, ::step] * coarse[..., None], coarse)
     lit = ~cast_shadows(heights, np.asarray(lights, np.float64))
     rows, columns = np.nonzero(mask)
-    return np.asarray(lit[rows // step, columns // step])
+    return lit[rows // step, columns // step]
 
 
 def _normal_error(normals: Float32Array, confidence: Float32Array | None) -> Float32Array:

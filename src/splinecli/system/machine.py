@@ -201,7 +201,8 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 Device = Literal["auto", "cpu", "cuda"]
-Precision = Literal["auto", "float32", "bfloat16"]
+NumberFormat = Literal["float32", "bfloat16"]
+Precision = Literal["auto"] | NumberFormat
 
 
 def choose_device(name: Device | str) -> torch.device:
@@ -218,7 +219,7 @@ def choose_device(name: Device | str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
-def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
+def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
     """Return the number format of this name; "auto" is bfloat16 if the device supports it
     natively.
     """

@@ -27,6 +27,7 @@ from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat,
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
@@ -168,8 +169,8 @@ def _to_normals(
         _check_lengths(values, mask, path)
     normals = np.zeros(values.shape, np.float32)
     rows, columns = np.nonzero(mask)
-    for start in range(0, len(rows), _BLOCK):
-        block = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
+    for part in slices(len(rows), _BLOCK):
+        block = rows[part], columns[part]
         if stored.is_picture:
             normals[block] = decode_picture(values[block])
         else:

@@ -37,6 +37,7 @@ from splinecli.lights.lighting import LightingAt
 from splinecli.maths import Bools, Float32Array
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import map_scale
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
@@ -324,14 +325,8 @@ class DistilledEstimator(Estimator):
         found: Distillation,
         size: StudentSize,
     ) -> None:
-        self._teacher, self._perceptron, self._sample, self._size = (
-            teacher,
-            perceptron,
-            sample,
-            size,
-        )
-        self.distillation = found
-        self.n_unlike = 0
+        self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
+        self._size, self.distillation, self.n_unlike = size, found, 0
         self.name, self.weights = teacher.name, teacher.weights
         self.refiner = teacher.refiner
         self.device, self.precision = teacher.device, teacher.precision
@@ -389,8 +384,7 @@ class DistilledEstimator(Estimator):
             unlike[rows] = self._sample.unlike(inputs).cpu().numpy() & ~dark
             return rows
 
-        tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
-        for rows in side_by_side(apply, tiles):
+        for rows in side_by_side(apply, slices(len(observations), _TILE)):
             progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
@@ -457,9 +451,12 @@ def distil(
     with torch.inference_mode():
         learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
-    mean_deg, p95_deg = float(angles.mean()), float(np.quantile(angles, 0.95))
     found = Distillation(
-        len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean())
+        sample=len(inputs),
+        held_out=held,
+        mean_deg=float(angles.mean()),
+        p95_deg=float(np.quantile(angles, 0.95)),
+        expected_deg=float(median_error_deg(errors[:held]).mean()),
     )
     return DistilledEstimator(teacher, perceptron, sample, found, size)
 

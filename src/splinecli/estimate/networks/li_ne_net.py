@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, pixel_shuffle, pixel_unshuffle, softplus
 
 from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.maths.pixel_grid import slices
 
 PATCH = 4  # side length in cells of the patches that an encoder combines into one position
 Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
@@ -124,16 +125,15 @@ class MapEncoder(nn.Module):
         layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
         found = maps.new_empty(len(maps), SIDE**2, self.position.shape[1])
-        for start in range(0, len(maps), _AT_ONCE):
+        for part in slices(len(maps), _AT_ONCE):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
-            split = maps[start : start + _AT_ONCE].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
+            split = maps[part].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
             patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
             x = linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
-            for first, second in zip(
-                layers[::2], layers[1::2], strict=True
-            ):  # of each residual block
+            # of each residual block
+            for first, second in zip(layers[::2], layers[1::2], strict=True):
                 x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
-            found[start : start + _AT_ONCE] = x.transpose(0, 1)
+            found[part] = x.transpose(0, 1)
         return found.transpose(1, 2).view(-1, self.position.shape[1], SIDE, SIDE)
 
 

@@ -39,6 +39,17 @@ class CaptureContext(NamedTuple):
     layers: tuple[Summary, ...]  # one for each layer of the set branch
 
 
+class ScaledPixels(NamedTuple):
+    """The inputs of the set branch: P pixels, each divided by its largest observation."""
+
+    observed: Tensor  # (P, F)
+    lights: Tensor  # (P, F, 3), unit, in the pixels' frames
+    residuals: Tensor  # (P, F), of the robust Lambertian fit
+    valid: Tensor | None  # (P, F) bool, or None for all
+    normals: Tensor  # (P, K, 3), the starting normals, unit or zero
+    scale: Tensor  # (P, 1), the largest observations
+
+
 class PixelTokens(NamedTuple):
     """The tokens of P pixels, and the numbers that they are relative to; see
     SplineNet.encode_pixels.
@@ -159,26 +170,15 @@ class SetBranch(nn.Module):
         self.weigh = zeroed(nn.Linear(width, 2))
 
     def forward(
-        self,
-        observed: Tensor,
-        lights: Tensor,
-        residual: Tensor,
-        valid: Tensor | None,
-        normals: Tensor,
-        scale: Tensor,
-        *,
-        captures: int = 1,
-        context: CaptureContext | None = None,
+        self, pixels: ScaledPixels, captures: int = 1, context: CaptureContext | None = None
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
         """Return the pixels' tokens (P, width), the unit normals (P, 3) of least squares, and the
         captures' context.
 
-        The observed values and residuals (P, F) of each pixel are divided by its largest
-        observation, `scale` (P, 1). The lights (P, F, 3) are unit, in the pixels' frames, `valid`
-        (P, F) is None for all, and the starting normals (P, K, 3) are unit or zero. Pixel p belongs
-        to capture p % `captures`. Without a context, the pixels of each capture attend to each
-        other.
+        Pixel p belongs to capture p % `captures`. Without a context, the pixels of each capture
+        attend to each other.
         """
+        observed, lights, residual, valid, normals, scale = pixels
         half = normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + 1e-3).log()  # the offset keeps the logarithm finite
         values = torch.stack((observed, log_observed, residual), dim=-1)

@@ -17,7 +17,12 @@ from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.networks.config import NetworkConfig, fit_normals
 from splinecli.estimate.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet, PaperNENet
 from splinecli.estimate.networks.refine_net import RefineNet
-from splinecli.estimate.networks.set_branch import CaptureContext, PixelTokens, SetBranch
+from splinecli.estimate.networks.set_branch import (
+    CaptureContext,
+    PixelTokens,
+    ScaledPixels,
+    SetBranch,
+)
 from splinecli.maths.observation_map import (
     cell_directions,
     map_scale,
@@ -273,8 +278,10 @@ class SplineNet(nn.Module):
         self, maps: PixelMaps, normals: Tensor, captures: int, context: CaptureContext | None
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
         assert self.set_branch is not None
-        inputs = maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
-        return self.set_branch(*inputs, captures=captures, context=context)  # type: ignore[no-any-return]
+        pixels = ScaledPixels(
+            maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
+        )
+        return self.set_branch(pixels, captures, context)  # type: ignore[no-any-return]
 
 
 def _starting_normals(maps: PixelMaps) -> Tensor:

@@ -21,6 +21,7 @@ from splinecli.estimate.refinement.tiles import Box, pixels_before
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
 from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import on_map
 from splinecli.system.machine import side_by_side
 
 # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
@@ -111,10 +112,11 @@ class HalfCapture:
             np.count_nonzero(self.mask[: rows.start]) - 1
         )
         mask, numbers = mask[:, columns], numbers[:, columns]
-        values = np.zeros((*mask.shape, 5), np.float32)
         some = numbers[mask]
-        values[mask] = np.hstack((self.normals[some], self.errors[some]))
-        maps = enlarge(torch.from_numpy(values).permute(2, 0, 1), torch.from_numpy(mask))
+        values = np.hstack((self.normals[some], self.errors[some]))
+        maps = enlarge(
+            torch.from_numpy(on_map(values, mask)).permute(2, 0, 1), torch.from_numpy(mask)
+        )
         top, left = box[0].start - 2 * rows.start, box[1].start - 2 * columns.start
         maps = maps[
             :, top : top + box[0].stop - box[0].start, left : left + box[1].stop - box[1].start

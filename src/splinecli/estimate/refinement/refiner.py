@@ -48,6 +48,7 @@ from splinecli.estimate.refinement.tiles import (
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
 from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.observation_map import map_scale
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress, ignore
 
@@ -255,8 +256,7 @@ class NetworkRefiner:
             tile.rows[tile.mask],
             torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device),
         )
-        for start in range(0, len(rows), LIT_AT_ONCE):
-            part = slice(start, start + LIT_AT_ONCE)
+        for part in slices(len(rows), LIT_AT_ONCE):
             maps.view(-1, columns)[places[part]] = values_of(
                 rows[part], lighting_at(rows[part]), part
             )
@@ -292,8 +292,7 @@ def _turn_back(normals: Float32Array, rows: PixelIndices, lighting_at: LightingA
     """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in
     place.
     """
-    for start in range(0, len(rows), LIT_AT_ONCE):
-        part = slice(start, start + LIT_AT_ONCE)
+    for part in slices(len(rows), LIT_AT_ONCE):
         light = lighting_at(rows[part])
         if light.turns is None:
             break

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from splinecli.estimate.networks.refine_net import COARSEST, Part
 from splinecli.maths import Bools, Float32Array, Integers
+from splinecli.maths.pixel_grid import bounds
 
 Box = tuple[slice, slice]  # rows and columns of a map, both with a start and a stop
 
@@ -92,18 +93,13 @@ def around_object(mask: Bools) -> Bools:
     """Return the part of a mask that has pixels, between multiples of COARSEST. Behind the map it
     has a margin.
     """
-    bounds = []
-    for axis in (1, 0):
-        places = np.flatnonzero(mask.any(axis=axis))
-        bounds.append(
-            slice(places[0] // COARSEST * COARSEST, -(-(places[-1] + 1) // COARSEST) * COARSEST)
-        )
-    part = mask[tuple(bounds)]
-    missing = [
-        (0, side.stop - side.start - length)
-        for side, length in zip(bounds, part.shape, strict=True)
-    ]
-    return np.pad(part, missing)
+    (top, bottom), (left, right) = (
+        (first // COARSEST * COARSEST, -(-(last + 1) // COARSEST) * COARSEST)
+        for first, last in bounds(mask)
+    )
+    part = mask[top:bottom, left:right]
+    height, width = part.shape
+    return np.pad(part, ((0, bottom - top - height), (0, right - left - width)))
 
 
 def turned_part(part: Part, shape: tuple[int, ...], quarters: int) -> Part:
