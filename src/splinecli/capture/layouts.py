@@ -97,18 +97,11 @@ def list_cyclesps(folder: Path) -> list[Path] | None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
-    captures = [
-        entry
-        for entry in files.list_folder(folder)
-        if entry.name.startswith(_PREFIX) and is_folder(entry)
-    ]
+    captures = [path for path in _subfolders(folder) if path.name.startswith(_PREFIX)]
     # Images beside light.txt are a plain folder, to be used with --lights light.txt.
     no_photographs = files.NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return (
-        None
-        if not captures and files.list_images(folder, leave_out_stems=no_photographs)
-        else captures
-    )
+    is_plain = not captures and files.list_images(folder, leave_out_stems=no_photographs)
+    return None if is_plain else captures
 
 
 def _name(images_folder: Path) -> str:
@@ -201,22 +194,17 @@ def _own_name(folder: Path) -> str:
     """Return the name of a folder, or its parent's name if the folder is called `images`. Raises
     InputError.
     """
-    name = files.folder_name(folder)
-    return (
-        files.folder_name(_parent(folder))
-        if name in files.IMAGE_FOLDERS and _parent(folder) != folder
-        else name
-    )
+    name, parent = files.folder_name(folder), _parent(folder)
+    inside = name in files.IMAGE_FOLDERS and parent != folder
+    return files.folder_name(parent) if inside else name
 
 
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None or not all(
-        map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))
-    ):
+    if inside is None or not all(map(_is_other, files.list_images(folder))):
         return None
-    return inside if files.list_images(inside, leave_out_stems=files.NOT_PHOTOGRAPHS) else None
+    return inside if files.list_images(inside) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -256,9 +244,7 @@ def _captures_in(folder: Path) -> list[Path]:
         is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
             files.find_named(folder, [files.FILENAMES]) is not None
-            or files.list_images(
-                objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS
-            )
+            or files.list_images(objects if is_psbox else folder)
             or _images_folder(folder) is not None
         ):
             return [folder]
@@ -285,9 +271,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     """
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
-    images, _ = files.find_images(
-        of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
-    )
+    images, _ = files.find_images(of_images, leave_out=overrides.named())
     # Without a light file, nothing gives the number of photographs.
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
@@ -323,9 +307,7 @@ def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles 
     objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
-    images = files.list_images(
-        objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
-    )
+    images = files.list_images(objects, leave_out=overrides.named())
     files.check_not_empty(images, objects)
     return _gather("PSBox", folder, images, lights, overrides)
 
@@ -343,10 +325,8 @@ def _gather(
 
     Files named by the user take precedence over files in the folder.
     """
-    mask, warnings = (
-        overrides.mask or files.find_named(folder, files.MASK),
-        tuple[CaptureWarning, ...](),
-    )
+    mask = overrides.mask or files.find_named(folder, files.MASK)
+    warnings: tuple[CaptureWarning, ...] = ()
     if mask is None:
         mask, warnings = files.choose_mask(folder, images)
         others = tuple(path for path in others if not warnings or not files.is_mask_name(path))

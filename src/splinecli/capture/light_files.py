@@ -45,14 +45,6 @@ def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     )
 
 
-def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
-    return rows_text(directions).encode()
-
-
-def _encode_csv(directions: Float64Array, images: Sequence[Path]) -> bytes:
-    return ("x,y,z\n" + rows_text(directions).replace(" ", ",")).encode()
-
-
 def _encode_lp(directions: Float64Array, images: Sequence[Path]) -> bytes:
     rows = zip(images, rows_text(directions).splitlines(), strict=True)
     text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
@@ -83,7 +75,11 @@ class LightFormat:
 
 FORMATS = (
     LightFormat(
-        "text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text
+        "text",
+        (),
+        _read_text,
+        ("light_directions.txt", "lights.txt"),
+        encode=lambda directions, _: rows_text(directions).encode(),
     ),
     LightFormat(
         "NumPy",
@@ -97,7 +93,12 @@ FORMATS = (
     LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
     LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
     LightFormat(
-        "CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_csv
+        "CSV",
+        (".csv",),
+        _read_text,
+        ("light_directions.csv", "lights.csv"),
+        2,
+        encode=lambda directions, _: f"x,y,z\n{rows_text(directions)}".replace(" ", ",").encode(),
     ),
     LightFormat(
         "MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2
@@ -125,9 +126,8 @@ def light_names() -> str:
 
 def light_suffixes() -> str:
     """Return the suffixes of light files, for help."""
-    return ", ".join(
-        dict.fromkeys(("text", *(suffix for each in FORMATS for suffix in each.suffixes)))
-    )
+    suffixes = (suffix for each in FORMATS for suffix in each.suffixes)
+    return ", ".join(dict.fromkeys(("text", *suffixes)))
 
 
 def find_lights(folder: Path) -> Path | None:
@@ -137,12 +137,8 @@ def find_lights(folder: Path) -> Path | None:
     entries = list_folder(folder)
     for rank in sorted({each.rank for each in FORMATS}):
         names = [name for each in FORMATS if each.rank == rank for name in each.found]
-        paths = [
-            e
-            for name in names
-            for e in entries
-            if fnmatchcase(e.name.lower(), name) and is_found_file(e)
-        ]
+        matches = (e for name in names for e in entries if fnmatchcase(e.name.lower(), name))
+        paths = list(filter(is_found_file, matches))
         if rank and len(paths) > 1:
             raise InputError(
                 f"found {len(paths)} light files: {', '.join(path.name for path in paths)}",
@@ -167,18 +163,15 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
             entries.sort(key=lambda e: "light" not in e.name.lower())
             for path in entries[:50]:
                 name = path.name.lower()
-                if (
-                    re.search("intens|camera|filenames|lobes", name)
-                    or path.stat().st_size > numbers.MOST_TEXT
-                ):
+                is_other = re.search("intens|camera|filenames|lobes", name)
+                if is_other or path.stat().st_size > numbers.MOST_TEXT:
                     continue
                 angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
                 for form in ("xyz", angles):
                     with suppress(InputError):
                         read_lights(path, n_images, form=form)
-                        return f"--lights {path}" + (
-                            f" --light-format {form}" if form != "xyz" else ""
-                        )
+                        option = f"--lights {path}"
+                        return option if form == "xyz" else f"{option} --light-format {form}"
     return None
 
 
@@ -257,13 +250,10 @@ def lights_of(
         vectors = light_rows.directions_from_angles(vectors, form)
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
+    place = " in column " if transposed else " as light "
     places = [
-        f" in column {light + 1}"
-        if transposed
-        else f" as light {light + 1}"
-        if lines[light] is None
-        else ""
-        for light in range(len(vectors))
+        f"{place}{light}" if transposed or line is None else ""
+        for light, line in enumerate(lines, start=1)
     ]
     lamps = form == "positions"
     return vectors, unit_directions(
@@ -296,9 +286,8 @@ def unit_directions(
     # float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
-    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(
-        directions
-    ):  # the frame is right
+    # With so few, the frame is right.
+    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(directions):
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
@@ -412,11 +401,8 @@ def _one_light_a_row(
         if n_images is None or len(lights) == n_images:
             return lights, transposed
     count = len(readings[0][0])
-    what = (
-        {"light directions": "light direction", "lights": "light"}.get(what, what)
-        if count == 1
-        else what
-    )
+    if count == 1 and what in ("light directions", "lights"):
+        what = what[:-1]
     problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
     error = WrongCountError(problem, table.path, hint=hint)
@@ -480,10 +466,8 @@ def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes
     """
     encode = format_of(path).encode
     if encode is None:
-        *most, last = (
-            ".txt",
-            *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes),
-        )
+        suffixes = (each.suffixes[0] for each in FORMATS if each.encode and each.suffixes)
+        *most, last = ".txt", *suffixes
         raise UsageError(
             f"{path}: light files of the type {path.suffix.lower()} are only read",
             hint=f"Write {', '.join(most)} or {last}",

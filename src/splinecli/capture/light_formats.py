@@ -147,10 +147,8 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
         raise InputError(
             f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path
         )
-    vectors, factors = (
-        _vectors(document[key], "xyz"),
-        _vectors(document.get("ledAdjust"), "rgb") or [],
-    )
+    vectors = _vectors(document[key])
+    factors = _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
         raise InputError(f'the list "{key}" does not have x, y and z for each light', path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
@@ -166,11 +164,7 @@ def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] |
     """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's
     light by its name.
     """
-    if (
-        isinstance(document, dict)
-        and len(document) == 1
-        and _vectors(*document.values()) is not None
-    ):
+    if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()):
         (document,) = document.values()
     names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
     vectors = _vectors(document if names is None else list(document.values()))
@@ -181,18 +175,15 @@ def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
     """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None
     for anything else.
     """
-    listed = values if isinstance(values, list) else []
-    vectors: list[Any] = [
-        [each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed
-    ]
-    if not all(
-        isinstance(vector, list)
-        and len(vector) > 1
-        and all(type(number) in (int, float) for number in vector)
-        for vector in vectors
-    ):
-        return None
-    return [[float(number) for number in vector] for vector in vectors] or None
+    vectors = []
+    for each in values if isinstance(values, list) else []:
+        vector = [each.get(key) for key in keys] if isinstance(each, dict) else each
+        if not isinstance(vector, list) or len(vector) < 2:
+            return None
+        if any(type(number) not in (int, float) for number in vector):
+            return None
+        vectors.append([float(number) for number in vector])
+    return vectors or None
 
 
 def _unnumbered(
@@ -230,15 +221,10 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     if suffix == ".npy":
         array = _read_npy(path)
     else:
-        array = _choose(
-            numbers.read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images
-        )
-    if (
-        array.ndim != 2
-        or array.dtype.kind not in "fiu"
-        or not array.size
-        or not np.isfinite(array).all()
-    ):
+        read = numbers.read_matrices if suffix == ".mat" else _read_opencv
+        array = _choose(read(path), path, n_images)
+    is_matrix = array.ndim == 2 and array.dtype.kind in "fiu" and array.size
+    if not is_matrix or not np.isfinite(array).all():
         raise InputError(
             f"found an array of shape {array.shape} and type {array.dtype},"
             " expected finite numbers N x 3",
@@ -250,13 +236,10 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 
 def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
-    lights = {
-        name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape
-    }
+    lights = {name: m for name, m in matrices.items() if m.ndim == 2 and 3 in m.shape}
     if len(lights) > 1:
-        lights = {
-            name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))
-        } or lights
+        usual = (n_images, 3), (3, n_images)
+        lights = {name: m for name, m in lights.items() if m.shape in usual} or lights
     if len(lights) == 1:
         return next(iter(lights.values()))
     sizes = ", ".join(
@@ -286,9 +269,8 @@ def _read_opencv(path: Path) -> dict[str, Float64Array]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
     text = numbers.read_text(path).decode(errors="replace")
     found: dict[str, Float64Array] = {}
-    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(
-        text
-    ):
+    pattern = _XML if path.suffix.lower() == ".xml" else _YAML
+    for name, rows, columns, data in pattern.findall(text):
         try:
             values = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
             found[name] = values.reshape(int(rows), int(columns))

@@ -61,19 +61,14 @@ class LightFrame:
         direction are left out.
         """
         words = [EXCHANGED] if self.exchanged else []
-        words += [
-            name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1
-        ]
+        words += [word for word, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] < 0]
         return ",".join(words) or "x-right,y-up"
 
     def describe(self) -> str:
         """Return words such as "x and y exchanged, y negated"; empty for the usual frame."""
-        negated = " and ".join(
-            axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0
-        )
         parts = ["x and y exchanged"] if self.exchanged else []
-        if negated:
-            parts.append(f"{negated} negated")
+        if negated := [axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0]:
+            parts.append(f"{' and '.join(negated)} negated")
         return ", ".join(parts)
 
     def after(self, first: LightFrame) -> LightFrame:
@@ -217,9 +212,8 @@ def refuse_angles(table: NumberRows) -> None:
             f"{'a number and two angles' if numbered else '2 columns of angles'},"
             " expected 3 columns (x y z)"
         )
-    elif (
-        lengths == {3} and not numbered
-    ):  # perhaps with the same radius; vectors around an object have y < 0
+    elif lengths == {3} and not numbered:
+        # perhaps with the same radius; vectors around an object have y < 0
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
@@ -235,10 +229,9 @@ def counts_rows(column: list[float]) -> int | None:
     """Return the first number of a column that counts the rows in some order, 0 or 1; None for any
     other column.
     """
-    ordered = sorted(column)
-    return next(
-        (first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None
-    )
+    first = min(column)
+    counts = first in (0, 1) and sorted(column) == [first + place for place in range(len(column))]
+    return int(first) if counts else None
 
 
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
@@ -315,11 +308,9 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
 
     def reorder(row: Row) -> Row:
         last = row.numbers[first:]
-        return (
-            row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order)))
-            if len(last) == -first
-            else row
-        )
+        if len(last) < len(order):
+            return row
+        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order)))
 
     return replace(table, rows=tuple(map(reorder, table.rows)))
 
