@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.maths import Array
 from splinecli.system import files
 from splinecli.system.files import (
     UNFINISHED,
@@ -141,7 +141,7 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-Content = bytes | str | Array  # of a file; see NewFiles.write
+Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
 

@@ -3,22 +3,20 @@ unpickled.
 """
 
 import hashlib
-import json
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name, write_bytes
+from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name
 
 # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
 LONGEST = 500_000_000
-_LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
+LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 SHIPPED = resources.files("splinecli") / "assets"
 
@@ -31,33 +29,6 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         digest.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file, identical for identical content.
-
-    The library itself writes the metadata in random order.
-    """
-    content = save(tensors, metadata)
-    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
-    header = json.loads(content[_LENGTH_BYTES : _LENGTH_BYTES + length])
-    header["__metadata__"] = dict(sorted(metadata.items()))
-    ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    ordered += b" " * (-len(ordered) % _LENGTH_BYTES)  # tensors start at a multiple of 8 bytes
-    return (
-        len(ordered).to_bytes(_LENGTH_BYTES, "little") + ordered + content[_LENGTH_BYTES + length :]
-    )
-
-
-def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
-    """Write the parameters of a module as float16, with metadata and their checksum. Raises
-    OutputError.
-    """
-    half = {name: tensor.detach().cpu().half() for name, tensor in module.state_dict().items()}
-    tensors = {
-        name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()
-    }
-    write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
 
 
 def read_tensors(
@@ -78,7 +49,7 @@ def read_tensors(
         check_length(path, hint)
         with path.open("rb") as start:
             if (
-                length := int.from_bytes(start.read(_LENGTH_BYTES), "little")
+                length := int.from_bytes(start.read(LENGTH_BYTES), "little")
             ) > 1 << 20:  # a tensor takes about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:

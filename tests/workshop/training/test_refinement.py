@@ -10,8 +10,9 @@ import torch
 from splinecli.errors import ModelError, UsageError
 from splinecli.estimate.networks.refine_net import CHANNELS
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import load_weights, resolve_weights, save_weights
+from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.whole_capture import photograph_scene
 from splinecli.workshop.training import WEIGHTS, refinement, tasks

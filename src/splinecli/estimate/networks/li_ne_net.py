@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear, pixel_shuffle, pixel_unshuffle, softplus
+from torch.nn.functional import linear, pixel_shuffle, pixel_unshuffle
 
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.maths.pixel_grid import slices
@@ -144,7 +144,7 @@ class ErrorHead(nn.Module):
     """Estimates a log-logistic distribution of the error (P, 2) from NE-Net's hidden features and
     its normals.
 
-    The first number is the logarithm of the median error in radians, with _MORE_DEG added. The
+    The first number is the logarithm of the median error in radians, with MORE_DEG added. The
     second is the logarithm of the distribution's shape: a larger shape means a narrower
     distribution. The other layers are fixed while the head is trained, so it does not change the
     normals.
@@ -167,27 +167,18 @@ class ErrorHead(nn.Module):
 
 
 # Added to all errors. Otherwise the logarithm would emphasise differences between tiny errors.
-_MORE_DEG = 0.1
-
-
-def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
-    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under
-    distributions (P, 2).
-    """
-    median, shape = error.unbind(-1)
-    z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
-    return z + 2 * softplus(-z) - shape
+MORE_DEG = 0.1
 
 
 def probability_within(error: Tensor, limit_deg: float) -> Tensor:
     """Return the probability (P,) that the error is at most limit_deg."""
     median, shape = error.unbind(-1)
-    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + _MORE_DEG)) - median))
+    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + MORE_DEG)) - median))
 
 
 def median_error_deg(error: Tensor) -> Tensor:
     """Return the medians (P,) of distributions (P, 2) in degrees."""
-    return error[:, 0].exp().rad2deg() - _MORE_DEG
+    return error[:, 0].exp().rad2deg() - MORE_DEG
 
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features from confidence.py

@@ -293,9 +293,3 @@ def to_capture_frame(normals: Tensor, maps: PixelMaps) -> Tensor:
     if maps.mirrored:
         normals = normals * normals.new_tensor((1.0, -1.0, 1.0))
     return rotate_about_view_axis(normals, maps.cosine, -maps.sine)
-
-
-def to_pixel_frame(vectors: Tensor, maps: PixelMaps) -> Tensor:
-    """Rotate vectors (P, 3) from the capture's frame into the pixels' frames."""
-    turned = rotate_about_view_axis(vectors, maps.cosine, maps.sine)
-    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if maps.mirrored else turned

@@ -23,10 +23,9 @@ from splinecli.system.weight_files import (
     load_strictly,
     read_json_entry,
     read_tensors,
-    save_module,
 )
 
-FORMAT = "splinecli-weights-1"
+WEIGHTS_FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
 
 
@@ -39,12 +38,6 @@ class LoadedNetwork:
     sha256: str  # SHA-256 of the weight file
 
 
-def save_weights(network: SplineNet, path: Path) -> None:
-    """Write the parameters of a network as float16, with its configuration. Raises OutputError."""
-    config = json.dumps(network.config.to_dict(), sort_keys=True)
-    save_module(network, path, {"format": FORMAT, "config": config})
-
-
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     """Load the network in a weight file, named `name` or after the file without its suffix. Raises
     ModelError.
@@ -52,7 +45,7 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
-    tensors, metadata = read_tensors(path, FORMAT, hint)
+    tensors, metadata = read_tensors(path, WEIGHTS_FORMAT, hint)
     config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
     with torch.device(
         "meta"

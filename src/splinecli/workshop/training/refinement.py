@@ -16,7 +16,6 @@ from torch.nn.functional import pad
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_pixels
 from splinecli.estimate.methods.batched import NetworkEstimator
-from splinecli.estimate.networks.li_ne_net import error_negative_log_likelihood
 from splinecli.estimate.networks.refine_net import channels, split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork
@@ -43,7 +42,7 @@ from splinecli.workshop.synthesis.whole_capture import (
     photograph_scene,
     scatter,
 )
-from splinecli.workshop.training.objective import angles, balanced
+from splinecli.workshop.training.objective import angles, balanced, error_negative_log_likelihood
 
 # Captures simulated before the first step. With 64, the net memorised them and was worse on others
 # for half an hour.
