@@ -92,7 +92,10 @@ def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
     if path is None:
         return ChannelLights(np.eye(CHANNELS)[None], measured=False)
     matrix = read_number_rows(path).as_array()
-    if matrix.shape not in ((CHANNELS, CHANNELS), (CHANNELS * n_images, CHANNELS)):
+    if matrix.shape not in (
+        (CHANNELS, CHANNELS),
+        (CHANNELS * n_images, CHANNELS),
+    ):
         raise InputError(
             f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3,"
             " or 3 lines for each image",

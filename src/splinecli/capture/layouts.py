@@ -17,7 +17,7 @@ from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import (
     FORMATS,
-    find_lights,
+    find_light_file,
     light_names,
     light_option,
     read_light_directions,
@@ -239,7 +239,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    if find_lights(folder) is not None:
+    if find_light_file(folder) is not None:
         objects = folder / files.IMAGE_FOLDERS[0]
         is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
@@ -278,7 +278,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if listed or len(others) > 0.25 * len(images):  # so many are photographs
         others = ()
     images = tuple(image for image in images if image not in others)
-    lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
+    lights = overrides.lights or (find_light_file(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = (

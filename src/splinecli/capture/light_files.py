@@ -89,9 +89,9 @@ FORMATS = (
         encode=_encode_npy,
     ),
     LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
-    LightFormat("Relight", (".dome", ".json"), readers.read_json, ("*.dome",), 2),
-    LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
-    LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
+    LightFormat("Relight", (".dome", ".json"), readers.read_json_lights, ("*.dome",), 2),
+    LightFormat("JSON list", (".json",), readers.read_json_lights, ("light_directions.json",), 2),
+    LightFormat("AliceVision", (".json",), readers.read_json_lights, ("*lights.json",), 1),
     LightFormat(
         "CSV",
         (".csv",),
@@ -130,7 +130,7 @@ def light_suffixes() -> str:
     return ", ".join(dict.fromkeys(("text", *suffixes)))
 
 
-def find_lights(folder: Path) -> Path | None:
+def find_light_file(folder: Path) -> Path | None:
     """Return the light file in the folder; None for none. Raises InputError for several where none
     is the usual one.
     """
@@ -326,7 +326,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     for light, channel in np.argwhere(~light_rows.usable_intensities(intensities)):
         value, line = intensities[light, channel], table.rows[channel if transposed else light].line
         place = f" in column {light + 1}" if transposed else ""
-        expected = "above 0" if value <= 0 else light_rows.INTENSITIES
+        expected = "above 0" if value <= 0 else light_rows.INTENSITY_RANGE
         raise InputError(
             f"found the intensity {value:g}{place}, expected a number {expected}",
             table.path,
@@ -460,7 +460,7 @@ def read_lights(
     return table, lights_of(table, n_rows, frame, form, leave_bad=form != "positions")[1]
 
 
-def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
+def light_encoder(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
     """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only
     be read.
     """
@@ -477,6 +477,6 @@ def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
     """Return a light file of directions (F, 3) of images, in the format that its suffix names; see
-    check_writable.
+    light_encoder.
     """
-    return check_writable(path)(directions, images)
+    return light_encoder(path)(directions, images)

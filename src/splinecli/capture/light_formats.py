@@ -18,8 +18,8 @@ from msgspec import Struct, ValidationError, convert, field
 from numpy.typing import NDArray
 
 from splinecli.capture.formats import numbers
-from splinecli.capture.formats.numbers import NumberRows, Row, to_number
-from splinecli.capture.light_rows import INTENSITIES, RowForm, image_name, usable_intensities
+from splinecli.capture.formats.numbers import NumberRow, NumberRows, to_number
+from splinecli.capture.light_rows import INTENSITY_RANGE, RowForm, image_name, usable_intensities
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
 from splinecli.records.base import Positive
@@ -62,12 +62,12 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
         names.append(image_name(words[0], []))
         words = numbers.split_words(" ".join(words[1:]), decimal_commas=commas)[:3]
         vectors.append(
-            Row(tuple(numbers.parse_number(word, path, line) for word in words), line, text)
+            NumberRow(tuple(numbers.parse_number(word, path, line) for word in words), line, text)
         )
     return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
 
 
-def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+def read_json_lights(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision
     writes.
     """
@@ -83,7 +83,7 @@ def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     listed = _listed(document)
     if listed is None:
         return _read_alicevision(document, path)
-    rows = tuple(Row(tuple(vector), line) for line, vector in enumerate(listed[1], start=1))
+    rows = tuple(NumberRow(tuple(vector), line) for line, vector in enumerate(listed[1], start=1))
     return NumberRows(path, rows, listed[0])
 
 
@@ -155,7 +155,7 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
         raise InputError(
-            problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path
+            problem if usable else f'a factor of "ledAdjust" is not {INTENSITY_RANGE}', path
         )
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
@@ -193,7 +193,7 @@ def _unnumbered(
     intensities: Sequence[Sequence[float]],
 ) -> NumberRows:
     """Return vectors of a file without lines."""
-    rows = tuple(Row(tuple(vector), None) for vector in vectors)
+    rows = tuple(NumberRow(tuple(vector), None) for vector in vectors)
     given = np.array(intensities, np.float64) if intensities else None
     return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
 
@@ -217,7 +217,7 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     them from 1.
     """
     suffix = path.suffix.lower()
-    numbers.check_length(path, numbers.MOST_TEXT)
+    numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
     else:
@@ -231,7 +231,7 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
             path,
         )
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
-    return NumberRows(path, tuple(Row(tuple(row), line) for line, row in rows))
+    return NumberRows(path, tuple(NumberRow(tuple(row), line) for line, row in rows))
 
 
 def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:

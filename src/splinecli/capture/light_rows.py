@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from splinecli.capture.formats.numbers import (
+    NumberRow,
     NumberRows,
-    Row,
     parse_rows,
     read_rows_of_words,
     to_number,
@@ -32,7 +32,7 @@ AXIS_WORDS = {
 """The words of --light-frame: an axis of the file, and its sign in the usual frame."""
 
 _LEAST, _MOST = 1e-12, 1e12
-INTENSITIES = f"from {_LEAST:g} to {_MOST:g}"
+INTENSITY_RANGE = f"from {_LEAST:g} to {_MOST:g}"
 """The range of light intensities. Such numbers and their inverses are within the range of float32.
 """
 
@@ -306,7 +306,7 @@ def _order_of(header: list[str]) -> list[int]:
 def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
     first = -len(order)
 
-    def reorder(row: Row) -> Row:
+    def reorder(row: NumberRow) -> NumberRow:
         last = row.numbers[first:]
         if len(last) < len(order):
             return row
@@ -325,5 +325,5 @@ def image_name(text: str, numbers: list[str]) -> str:
 
 
 def usable_intensities(values: Float64Array) -> Bools:
-    """Return which values are within INTENSITIES."""
+    """Return which values are within INTENSITY_RANGE."""
     return (values >= _LEAST) & (values <= _MOST)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, stamp_content
 from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
-from splinecli.capture.light_files import FORMATS, find_lights, format_of, read_light_positions
+from splinecli.capture.light_files import FORMATS, find_light_file, format_of, read_light_positions
 from splinecli.capture.light_rows import LightFrame, read_light_rows
 from splinecli.capture.linearise import Window
 from splinecli.errors import InputError, UsageError
@@ -401,7 +401,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     lobes = _find("light_lobes.txt", folder, positions)
     stamp = tuple(map(stamp_content, filter(None, (positions, pixel_file, lobes))))
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
-    if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
+    if used and not scaled and positions in (find_light_file(folder), _path(options.positions)):
         raise InputError(
             "the scale of the lamp positions is unknown",
             positions,

@@ -23,7 +23,7 @@ from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.estimate.confidence import add_common_error, correct_errors
 from splinecli.estimate.methods import Estimator, make_estimator
-from splinecli.estimate.methods.estimator import TILE_PIXELS, confidence
+from splinecli.estimate.methods.estimator import TILE_PIXELS, confident_share
 from splinecli.lights import lighting
 from splinecli.lights.lighting import (
     IndirectLight,
@@ -279,7 +279,7 @@ def _confidence(errors: Float32Array) -> Float32Array:
     """
     found = np.empty(len(errors), np.float32)
     for part in slices(len(errors), TILE_PIXELS):
-        found[part] = confidence(errors[part])
+        found[part] = confident_share(errors[part])
     return found
 
 

@@ -141,7 +141,7 @@ A sharp lobe also changes with the normals' errors, at most by the last share of
 _STEPS = 4  # of the robust fit of a base
 
 
-class Sample(NamedTuple):
+class LitPixels(NamedTuple):
     """Observations with their geometry and errors."""
 
     observations: Tensor  # (P, F)
@@ -159,7 +159,7 @@ class Base(NamedTuple):
 
 
 def fit_base(
-    sample: Sample,
+    sample: LitPixels,
     slope: Tensor,
     offset: Tensor,
     of_facets: Tensor,
@@ -203,7 +203,7 @@ def lobe_error(geometry: Geometry, roughness: Tensor) -> Tensor:
     return (geometry.normal_error / (2 * wide.clamp(min=0.01))).clamp(max=_MOST_LOBE_ERROR)
 
 
-def predict_left_out(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
+def predict_left_out(sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
     """Return the predictions (P, F) of base * slope + offset, each fitted to the other observations
     of its pixel.
     """

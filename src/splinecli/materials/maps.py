@@ -20,7 +20,7 @@ from splinecli.materials.lobes import (
     F0_OF_SPECULAR,
     Base,
     Geometry,
-    Sample,
+    LitPixels,
     diffuse_lobe,
     facet_lobe,
     fit_base,
@@ -215,7 +215,7 @@ class _Pixels:
     reached: Bools  # (P, F)
     lighting_at: LightingAt
 
-    def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> Sample:
+    def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> LitPixels:
         """Return some of the pixels as the fits need them; `bright` is the albedo of bright
         pixels.
         """
@@ -230,7 +230,7 @@ class _Pixels:
         geometry = Geometry.of(own[0], directions, own[1])
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
         floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
-        return Sample(observations, geometry, reached.float(), floor, white)
+        return LitPixels(observations, geometry, reached.float(), floor, white)
 
     def brightness(self) -> tuple[float, float]:
         """Return the albedo of bright pixels, and the value of white in a picture."""
@@ -248,7 +248,9 @@ class _Pixels:
         )
 
 
-def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
+def _fit(
+    sample: LitPixels, gloss: Gloss, chosen: PixelIndices
+) -> tuple[Float32Array, Float32Array]:
     """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
     The columns are base, the contribution of white highlights to the weighted observations, which
@@ -279,7 +281,7 @@ def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Arr
 
 
 def _compare(
-    sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor
+    sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return a matte surface's reflectance (P,) and the two sums (P,) that determine how much of
     the material to trust.

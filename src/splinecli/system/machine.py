@@ -278,8 +278,8 @@ def cgroup_quotas() -> list[float]:
     return quotas
 
 
-Part = TypeVar("Part")
-Result = TypeVar("Result")
+_Part = TypeVar("_Part")
+_Result = TypeVar("_Result")
 _lock, _users, _threads = Lock(), 0, 0
 
 
@@ -311,17 +311,17 @@ def one_thread_each() -> Iterator[int]:
 
 
 def in_order(
-    function: Callable[[Part], Result],
-    parts: Iterable[Part],
+    function: Callable[[_Part], _Result],
+    parts: Iterable[_Part],
     threads: int = 1,
     start: Callable[[], object] | None = None,
-) -> Iterator[Result]:
+) -> Iterator[_Result]:
     """Yield function(part) of each part, in order, computed on so many threads, each of which calls
     `start` first.
 
     At most one result more than there are threads is kept. An error is raised when its part is due.
     """
-    waiting: deque[Future[Result]] = deque()
+    waiting: deque[Future[_Result]] = deque()
     pool = ThreadPoolExecutor(threads, "part", start)
     try:
         for part in parts:
@@ -335,7 +335,7 @@ def in_order(
 
 
 @contextmanager
-def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+def meanwhile(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start function() on another thread, and yield a callable that waits for its result or raises
     its error.
     """
@@ -343,7 +343,7 @@ def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
         yield pool.submit(function).result
 
 
-def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
+def side_by_side(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> Iterator[_Result]:
     """Yield function(part) of each part as in_order does, without gradients, on as many threads as
     PyTorch uses.
 

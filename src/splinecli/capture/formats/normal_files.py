@@ -23,7 +23,12 @@ import numpy as np
 from splinecli.capture.formats import images
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
+from splinecli.capture.formats.numbers import (
+    MOST_TEXT,
+    check_text_length,
+    read_mat,
+    read_number_rows,
+)
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
@@ -140,7 +145,7 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
     # characters of a number, with the separator after it
     most = 3 * height * width * 32 + MOST_TEXT
-    check_length(path, most, "a normal map")
+    check_text_length(path, most, "a normal map")
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
     except (ValueError, OSError):

@@ -43,7 +43,7 @@ lights.
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 
-class Row(NamedTuple):
+class NumberRow(NamedTuple):
     """A row of numbers, its one-based line in the file, and this line as written,
     without comments.
     """
@@ -58,7 +58,7 @@ class NumberRows:
     """The rows of numbers of a text file, at least one, all finite; their lengths may differ."""
 
     path: Path
-    rows: tuple[Row, ...] = field(repr=False)
+    rows: tuple[NumberRow, ...] = field(repr=False)
     # of each row's image, without folders; None if rows begin with numbers
     names: tuple[str, ...] | None = None
     intensities: Float64Array | None = None  # (R, 3), RGB, of the lights of a file that has them
@@ -96,7 +96,7 @@ def has_decimal_commas(text: str) -> bool:
     )
 
 
-def check_length(path: Path, most: int, expected: str = "a text file") -> None:
+def check_text_length(path: Path, most: int, expected: str = "a text file") -> None:
     """Raise InputError for a text file of more than `most` bytes, or for something that is not a
     file.
     """
@@ -119,7 +119,7 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
     check_file(path, expected, pipe=True)
     with reading(path):
         if not is_substitution(path):
-            check_length(path, most)
+            check_text_length(path, most)
             return path.read_bytes()
         if path not in _FROM_PIPES:
             with path.open("rb") as pipe:
@@ -197,7 +197,7 @@ def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
     if not rows:
         raise InputError("the file contains no numbers", path)
     parsed = (
-        Row(tuple(parse_number(word, path, line) for word in words), line, text)
+        NumberRow(tuple(parse_number(word, path, line) for word in words), line, text)
         for line, text, words in rows
     )
     return NumberRows(path, tuple(parsed))

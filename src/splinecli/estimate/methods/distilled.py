@@ -23,7 +23,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from splinecli.errors import UsageError
 from splinecli.estimate.fits.least_squares import weighted_least_squares
 from splinecli.estimate.methods.estimator import (
-    FEWEST_PIXELS,
+    FEWEST_TO_DISTIL,
     TOWARDS_CAMERA,
     UNKNOWN_ERROR,
     Directions,
@@ -287,7 +287,7 @@ _TILE = 8192  # with fewer pixels at once, two cores often wait for each other
 
 
 @dataclass(frozen=True)
-class Distillation:
+class DistilledFrom:
     """The learned perceptron, and how well it learned."""
 
     sample: int  # number of pixels that the network estimated for learning
@@ -322,7 +322,7 @@ class DistilledEstimator(Estimator):
         teacher: Estimator,
         perceptron: Perceptron,
         sample: PixelSample,
-        found: Distillation,
+        found: DistilledFrom,
         size: StudentSize,
     ) -> None:
         self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
@@ -416,7 +416,7 @@ def distil(
     lit = np.flatnonzero((light.observations > 0).any(axis=1))
     candidates = light.observations[lit]
     directions = directions_at(light.directions, lit)
-    if len(candidates) // 2 < FEWEST_PIXELS:  # the sample is at most half of them
+    if len(candidates) // 2 < FEWEST_TO_DISTIL:  # the sample is at most half of them
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
@@ -451,7 +451,7 @@ def distil(
     with torch.inference_mode():
         learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
-    found = Distillation(
+    found = DistilledFrom(
         sample=len(inputs),
         held_out=held,
         mean_deg=float(angles.mean()),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from splinecli.maths.observation_map import Grid
 
 
-FEWEST_PIXELS = 64  # the smallest sample that can be learned from
+FEWEST_TO_DISTIL = 64  # the smallest sample that can be learned from
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))  # of an unknown normal, whose confidence is 0
 
 
-def confidence(errors: Floats) -> Float32Array:
+def confident_share(errors: Floats) -> Float32Array:
     """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions
     (P, 2).
     """

@@ -43,7 +43,7 @@ class ResidualBlock(nn.Module):
         return change.add_(x) if change.dtype == x.dtype else x + change
 
 
-SIDE = 4  # patches along a side of the maps for which winograd_conv is written
+_SIDE = 4  # patches along a side of the maps for which winograd_conv is written
 _AT_ONCE = 256  # maps whose features stay in a processor's cache
 
 
@@ -73,18 +73,18 @@ def winograd_weights(weight: Tensor) -> Tensor:
 
 
 def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor:
-    """Convolve maps (16, P, C) of SIDE x SIDE positions with `winograd_weights`, padded with zeros:
+    """Convolve maps (16, P, C) of 4 x 4 positions with `winograd_weights`, padded with zeros:
     (16, P, D).
 
     It takes 36 products for the 144 of a convolution, and each transform is one product of
     matrices.
     """
     _, n_maps, width = x.shape
-    values = (_OF_VALUES @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
+    values = (_OF_VALUES @ x.view(_SIDE**2, -1)).view(-1, n_maps, width)
     products = torch.bmm(values, transformed)
     if bias is not None:
         products[7] += bias  # the transform adds this product to all positions, with a factor of 1
-    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
+    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(_SIDE**2, n_maps, -1)
 
 
 def is_float32(values: Tensor) -> bool:
@@ -111,30 +111,32 @@ class MapEncoder(nn.Module):
         self.blocks = nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
 
     def forward(self, maps: Tensor) -> Tensor:
-        if maps.shape[-1] == SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
+        if maps.shape[-1] == _SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
             return self._few_products(maps)
         patches = pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
         features: Tensor = self.blocks(self.patches(patches) + self.position)
         return features
 
     def _few_products(self, maps: Tensor) -> Tensor:
-        """Return the same features of maps of SIDE x SIDE patches by Winograd's algorithm, in half
+        """Return the same features of maps of 4 x 4 patches by Winograd's algorithm, in half
         of the time.
         """
         convolutions = [layer for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
         layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
-        found = maps.new_empty(len(maps), SIDE**2, self.position.shape[1])
+        found = maps.new_empty(len(maps), _SIDE**2, self.position.shape[1])
         for part in slices(len(maps), _AT_ONCE):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
-            split = maps[part].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
-            patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
+            split = maps[part].view(-1, maps.shape[1], _SIDE, PATCH, _SIDE, PATCH)
+            patches = split.permute(2, 4, 0, 1, 3, 5).reshape(
+                _SIDE**2, -1, self.patches.in_channels
+            )
             x = linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
             # of each residual block
             for first, second in zip(layers[::2], layers[1::2], strict=True):
                 x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
             found[part] = x.transpose(0, 1)
-        return found.transpose(1, 2).view(-1, self.position.shape[1], SIDE, SIDE)
+        return found.transpose(1, 2).view(-1, self.position.shape[1], _SIDE, _SIDE)
 
 
 HIDDEN = 64

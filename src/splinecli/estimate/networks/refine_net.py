@@ -46,7 +46,7 @@ def channels(name: str) -> slice:
     return slice(start, start + FEATURE_WIDTHS[name])
 
 
-CHANNELS = sum(FEATURE_WIDTHS.values())
+FEATURE_CHANNELS = sum(FEATURE_WIDTHS.values())
 READ = channels("noise").start  # number of channels read by the net
 # Channels with the x and y components of vectors, which rotate with the image.
 VECTORS = tuple(
@@ -92,7 +92,7 @@ WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resoluti
 SIGMAS = (0.7, 1.5, 3.0)
 # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
 COARSEST = 2 ** (len(WIDTHS) - 1)
-Part = tuple[slice, slice]  # rows and columns of a map
+Box = tuple[slice, slice]  # rows and columns of a map
 
 
 class RefineNet(nn.Module):
@@ -131,7 +131,7 @@ class RefineNet(nn.Module):
         self.reach = 96 * (1 + twice)  # 96 per net
 
     def forward(
-        self, features: Tensor, mask: Tensor, inner: Part | None = None
+        self, features: Tensor, mask: Tensor, inner: Box | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H,
         W) of 1 and 0.
@@ -146,7 +146,7 @@ class RefineNet(nn.Module):
             return found
         return self._correct(features, mask, inner)
 
-    def _correct(self, features: Tensor, mask: Tensor, inner: Part | None) -> tuple[Tensor, Tensor]:
+    def _correct(self, features: Tensor, mask: Tensor, inner: Box | None) -> tuple[Tensor, Tensor]:
         height, width = mask.shape[-2:]
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
@@ -218,7 +218,7 @@ def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype)
     return joined
 
 
-def _grown(part: Part, margin: int) -> Part:
+def _grown(part: Box, margin: int) -> Box:
     """Return a part with a margin, expanded to whole pixels of the coarsest scale. It may extend
     past the map.
     """
@@ -229,7 +229,7 @@ def _grown(part: Part, margin: int) -> Part:
     return rows, columns
 
 
-def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
+def _cells(part: Box, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
     """Return the index of a part in a map of the given scale that begins at the pixel `origin`."""
     rows, columns = (
         slice(side.start - start >> scale, side.stop - start >> scale)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from splinecli.estimate.networks.refine_net import gaussian_sum, reach_of, unit_maps
-from splinecli.estimate.refinement.tiles import Box, pixels_before
+from splinecli.estimate.networks.refine_net import Box, gaussian_sum, reach_of, unit_maps
+from splinecli.estimate.refinement.tiles import pixels_before
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
 from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.normals import unit
@@ -144,8 +144,8 @@ def _over_blocks(function: np.ufunc, values: Array) -> Array:
 
 FINE = 1.5  # detail is the part that a Gaussian filter with this sigma in pixels removes
 WINDOW = 3.0  # detail is compared in a Gaussian window with this sigma in pixels
-REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
-FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show noise well
+DETAIL_REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
+FEWEST_FOR_DETAIL = 6  # fewer have no residuals, or hardly any, and so do not show noise well
 _TINY = 1e-12
 
 

@@ -16,22 +16,22 @@ import torch
 
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.refine_net import (
-    CHANNELS,
     COARSEST,
-    Part,
+    FEATURE_CHANNELS,
+    Box,
     RefineNet,
     channels,
     unit_maps,
 )
 from splinecli.estimate.refinement.detail import (
-    FEWEST_LIGHTS,
+    DETAIL_REACH,
+    FEWEST_FOR_DETAIL,
     HalfCapture,
     restore_detail,
     restore_octave,
 )
-from splinecli.estimate.refinement.detail import REACH as DETAIL_REACH
 from splinecli.estimate.refinement.features import (
-    Turn,
+    MapTurn,
     brightness,
     refine_features,
     turn_features,
@@ -142,7 +142,7 @@ class NetworkRefiner:
         )
         if len(capture.normals) > self.most_pixels:
             turns = 1
-            if len(capture.signs) >= FEWEST_LIGHTS:
+            if len(capture.signs) >= FEWEST_FOR_DETAIL:
                 half = HalfCapture.of(capture.mask, capture.lighting_at, *whole, capture.reference)
                 margin, of_half = (
                     _DETAIL_MARGIN,
@@ -187,7 +187,7 @@ class NetworkRefiner:
             above = band
         above.write()
 
-    def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
+    def _see(self, capture: _Capture, tile: Tile, seen: Box, turns: int) -> Maps:
         """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged
         over rotations.
         """
@@ -202,10 +202,10 @@ class NetworkRefiner:
                 capture.signs,
             )
 
-        features = self._maps(tile, CHANNELS, capture.lighting_at, features_of)
+        features = self._maps(tile, FEATURE_CHANNELS, capture.lighting_at, features_of)
         mask = self._tensor(tile.mask)[None]
         normals, errors = self._average_turns(features, mask, seen, turns)
-        if len(capture.signs) >= FEWEST_LIGHTS:
+        if len(capture.signs) >= FEWEST_FOR_DETAIL:
             features = features[:, *seen]
             estimated = features[channels("normal")]
             least_squares = estimated + features[channels("plain")]
@@ -214,7 +214,7 @@ class NetworkRefiner:
             )
         return normals, errors
 
-    def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
+    def _enlarge(self, capture: _Capture, tile: Tile, seen: Box, half: HalfCapture) -> Maps:
         """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's,
         with detail.
         """
@@ -263,13 +263,13 @@ class NetworkRefiner:
         return maps.permute(2, 0, 1)
 
     def _average_turns(
-        self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int
+        self, features: torch.Tensor, mask: torch.Tensor, wanted: Box, turns: int
     ) -> Maps:
         """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the
         turns of the map.
         """
         normals = errors = torch.zeros((), device=mask.device)
-        for turn in map(Turn, range(turns)):
+        for turn in map(MapTurn, range(turns)):
             turned, turned_mask = turn_features(features, turn), turn_maps(mask, turn)
             part = turned_part(wanted, mask.shape[-2:], turn.quarters)
             with torch.autocast(
@@ -299,7 +299,7 @@ def _turn_back(normals: Float32Array, rows: PixelIndices, lighting_at: LightingA
         normals[part] = light.in_frame_of_capture(normals[part])
 
 
-def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
+def _with_neighbours(part: Box, shape: Sequence[int]) -> tuple[Box, Box]:
     """Return a part of a map of this shape with all pixels that its detail depends on, and where
     the part is in it.
     """

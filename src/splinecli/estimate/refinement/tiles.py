@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.estimate.networks.refine_net import COARSEST, Part
+from splinecli.estimate.networks.refine_net import COARSEST, Box
 from splinecli.maths import Bools, Float32Array, Integers
 from splinecli.maths.pixel_grid import bounds
-
-Box = tuple[slice, slice]  # rows and columns of a map, both with a start and a stop
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class Tile:
     # (h, w), of the box; multiples of COARSEST, so that a rotated tile has the same cells
     mask: Bools
     rows: Integers  # (h, w), the rows of its pixels in the capture
-    inner: Part  # the part of the box without the margin
+    inner: Box  # the part of the box without the margin
 
 
 class Band:
@@ -102,7 +100,7 @@ def around_object(mask: Bools) -> Bools:
     return np.pad(part, ((0, bottom - top - height), (0, right - left - width)))
 
 
-def turned_part(part: Part, shape: tuple[int, ...], quarters: int) -> Part:
+def turned_part(part: Box, shape: tuple[int, ...], quarters: int) -> Box:
     """Return where a part of a map of this shape is after a counterclockwise rotation by `quarters`
     quarter turns.
     """

@@ -20,7 +20,7 @@ from splinecli.estimate.networks.refine_net import channels, split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork
 from splinecli.estimate.refinement.features import (
-    Turn,
+    MapTurn,
     brightness,
     refine_features,
     turn_features,
@@ -176,7 +176,7 @@ class ScenePool:
         ):
             example = self.examples[int(index)]
             draw = torch.rand(3, generator=generator, device=generator.device).tolist()
-            turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
+            turn = MapTurn(int(4 * draw[0]), draw[1] < 0.5)
             features = turn_features(example.features, turn).clone()
             if draw[2] < 0.5:
                 features[channels("halves")].neg_()
