@@ -120,7 +120,7 @@ def _widest_at(correlation: float) -> float:
     """
     sigmas = np.linspace(0.05, 2, 200)
     # of the values, at one and two pixels
-    one, two = (np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2))
+    one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
     return float(np.interp(correlation + 0.1, of_gradients, sigmas))
 

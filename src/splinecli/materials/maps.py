@@ -43,7 +43,7 @@ _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _SURE = 0.1  # the error of a roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
 # of the bright pixels' albedo and the mean observation: errors of all observations
-_FLOOR, _FLAT = (0.005, 0.12)
+_FLOOR, _FLAT = 0.005, 0.12
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence
@@ -220,14 +220,13 @@ class _Pixels:
         pixels.
         """
         light: PixelLighting = self.lighting_at(chosen)
-        normals, normal_error = (
+        observations, directions, normals, normal_error = float_tensors(
+            light.observations,
+            light.directions,
             light.in_frame_of_pixels(self.normals[chosen]),
             self.normal_error[chosen],
         )
-        observations, directions, *own = float_tensors(
-            light.observations, light.directions, normals, normal_error
-        )
-        geometry = Geometry.of(own[0], directions, own[1])
+        geometry = Geometry.of(normals, directions, normal_error)
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
         floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
         return LitPixels(observations, geometry, reached.float(), floor, white)
@@ -260,11 +259,8 @@ def _fit(
     def column(values: Tensor) -> Tensor:
         return values[chosen][:, None]
 
-    geometry, roughness, metalness = (
-        sample.geometry,
-        column(gloss.roughness),
-        column(gloss.metalness),
-    )
+    geometry = sample.geometry
+    roughness, metalness = column(gloss.roughness), column(gloss.metalness)
     facets = facet_lobe(geometry, roughness, column(gloss.tail))
     of_facets = metalness * facets
     slope = (1 - metalness) * diffuse_lobe(geometry, column(gloss.minnaert)) + of_facets

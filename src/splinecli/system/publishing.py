@@ -91,11 +91,11 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
                 return file
         file.close()
         if not got and not wait:
-            problem, hint = (
+            raise BusyError(
                 "another splinecli process is writing into this folder",
-                "Wait for it to end",
+                path.parent,
+                hint="Wait for it to end, or choose another -o",
             )
-            raise BusyError(problem, path.parent, hint=f"{hint}, or choose another -o")
         if not got:
             time.sleep(0.02)
 

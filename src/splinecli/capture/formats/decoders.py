@@ -154,11 +154,9 @@ def pages(path: Path) -> list[Path]:
             count = len(page.parent.pages)
     except (InputError, OSError):
         return [path]
-    return (
-        [path.with_name(f"{path.name}[{number}]") for number in range(count)]
-        if 1 < count < 10_000
-        else [path]
-    )
+    if not 1 < count < 10_000:
+        return [path]
+    return [path.with_name(f"{path.name}[{number}]") for number in range(count)]
 
 
 @contextmanager
@@ -210,9 +208,7 @@ def _decode_page(page: Any) -> Array | None:
         return None
     try:
         pixels: Array = page.asarray()
-    except (
-        Exception
-    ) as error:  # the type of the error for a missing codec depends on tifffile's version
+    except Exception as error:  # of a type that depends on tifffile's version for a missing codec
         if is_out_of_memory(error):
             raise
         return None

@@ -399,14 +399,11 @@ def check_exposures(images: Sequence[ImageHeader]) -> None:
         first, expected = found[0]
         # Shutters and ISO numbers are rounded.
         if abs(exposure.relative / expected.relative - 1) > 0.1:
-            hint = (
-                "Expose all images alike, or give each image's exposure as the intensity of its"
-                " light"
-            )
             raise InputError(
                 f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
                 facts.path,
-                hint=f"{hint} (--intensities FILE)",
+                hint="Expose all images alike, or give each image's exposure as the intensity of"
+                " its light (--intensities FILE)",
             )
 
 
@@ -432,15 +429,11 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
         f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
     )
     tags = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
-    automatic = [
-        word
-        for word, tag in tags.items()
-        if any((facts.exif or {}).get(tag) == 0 for facts in images)
-    ]
+    stated = [facts.exif or {} for facts in images]
+    automatic = [word for word, tag in tags.items() if any(each.get(tag) == 0 for each in stated)]
     if automatic:
-        text += (
-            f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
-        )
+        chosen = " and ".join(automatic)
+        text += f" The camera chose {chosen}: fix them, and expose all images alike."
     return [exposure.relative / mean for exposure in found], text
 
 

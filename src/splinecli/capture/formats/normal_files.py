@@ -260,7 +260,7 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
             channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path)
-    for name in (
+    names = (
         "Z",
         "Y",
         "R",
@@ -269,7 +269,8 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
         "RGB",
         "RGBA",
         *channels,
-    ):  # names of a depth, then any other
-        if name in channels:
-            return np.asarray(channels[name].pixels)
-    raise InputError("the EXR file has no channel", path)
+    )  # names of a depth, then any other
+    name = next((name for name in names if name in channels), None)
+    if name is None:
+        raise InputError("the EXR file has no channel", path)
+    return np.asarray(channels[name].pixels)

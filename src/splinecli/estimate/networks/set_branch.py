@@ -110,21 +110,15 @@ class ContextLayer(nn.Module):
         `known` is the summary of one capture; None uses the pixels themselves as the samples of
         their captures.
         """
-        embedded = (
-            self.embed(torch.cat((tokens, level), dim=1))
-            .view(-1, captures, tokens.shape[1])
-            .transpose(0, 1)
-        )
+        embedded = self.embed(torch.cat((tokens, level), dim=1))
+        embedded = embedded.view(-1, captures, tokens.shape[1]).transpose(0, 1)
         summary = self._summarise(embedded) if known is None else known
         queries = self.query_norm(embedded)
         with torch.autocast(tokens.device.type, enabled=False):
             # Use float32, as in the set branch.
-            parts = (
-                _split(self.queries(queries.to(self.queries.weight.dtype))),
-                summary.keys,
-                summary.values,
-            )
-            found = scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
+            asked = _split(self.queries(queries.to(self.queries.weight.dtype)))
+            found = scaled_dot_product_attention(asked, summary.keys, summary.values)
+            found = found.transpose(1, 2).flatten(2)
         seen = torch.cat(
             (queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2
         )

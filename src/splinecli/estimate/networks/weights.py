@@ -47,12 +47,10 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
     tensors, metadata = read_tensors(path, WEIGHTS_FORMAT, hint)
     config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
-    with torch.device(
-        "meta"
-    ):  # allocates no memory, because the configuration may request any size
-        load_strictly(
-            SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path
-        )
+    # This allocates no memory, because the configuration may request any size.
+    with torch.device("meta"):
+        sizes = {key: tensor.to("meta") for key, tensor in tensors.items()}
+        load_strictly(SplineNet(config), sizes, path)
     network = SplineNet(config)
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():

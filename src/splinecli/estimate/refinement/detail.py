@@ -79,17 +79,12 @@ class HalfCapture:
             weights = np.maximum(largest, np.float32(_DARK * reference))
             found = np.hstack((normals[rows], errors[rows])) * weights
             sent = np.hstack((observations * equal, equal, found, weights))
-            maps, numbers = (
-                np.zeros((*seen.shape, sent.shape[1]), np.float32),
-                np.zeros(seen.shape, np.int32),
-            )
-            maps[seen], numbers[seen] = sent, rows
-            sums = _over_blocks(np.add, maps)[kept]
+            sums = _over_blocks(np.add, on_map(sent, seen))[kept]
             done = slice(done_above[first], done_above[last])
             small.observations[done] = sums[:, :-7] / sums[:, -7:-6]
             small.normals[done] = unit(sums[:, -6:-3])
             small.errors[done] = sums[:, -3:-1] / sums[:, -1:]
-            small.members[done] = _over_blocks(np.maximum, numbers)[kept]
+            small.members[done] = _over_blocks(np.maximum, on_map(rows, seen))[kept]
 
         for _ in side_by_side(halve, range(0, len(half), step)):
             pass

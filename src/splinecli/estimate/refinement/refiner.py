@@ -9,7 +9,7 @@ detail that is real; see detail.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 import torch
@@ -124,36 +124,36 @@ class NetworkRefiner:
         each tile with the number of its pixels.
         """
         middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
-        of_whole = (
+        capture = _Capture(
+            around_object(mask),
+            observations,
+            lighting_at,
+            normals,
+            errors,
             brightness(torch.from_numpy(observations)),
             alternating_signs(self._tensor(middle).view(-1, 3)),
         )
-        self._refine(
-            _Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole),
-            progress,
-        )
+        self._refine(capture, progress)
 
     def _refine(self, capture: _Capture, progress: Progress = ignore) -> None:
-        half, turns, margin, whole = (
-            None,
-            self.turns,
-            self.margin,
-            (capture.normals, capture.errors),
-        )
+        half, turns, margin = None, self.turns, self.margin
+        whole = capture.normals, capture.errors
         if len(capture.normals) > self.most_pixels:
             turns = 1
             if len(capture.signs) >= FEWEST_FOR_DETAIL:
                 half = HalfCapture.of(capture.mask, capture.lighting_at, *whole, capture.reference)
-                margin, of_half = (
-                    _DETAIL_MARGIN,
-                    (half.observations, half.lighting_at, half.normals, half.errors),
+                margin = _DETAIL_MARGIN
+                smaller = replace(
+                    capture,
+                    mask=around_object(half.mask),
+                    observations=half.observations,
+                    lighting_at=half.lighting_at,
+                    normals=half.normals,
+                    errors=half.errors,
                 )
-                self._refine(
-                    _Capture(around_object(half.mask), *of_half, capture.reference, capture.signs)
-                )
-        lit = (
-            torch.from_numpy(capture.observations).amax(dim=1) > 0
-        ).numpy()  # NumPy takes ten times as long
+                self._refine(smaller)
+        # NumPy takes ten times as long.
+        lit = (torch.from_numpy(capture.observations).amax(dim=1) > 0).numpy()
         above = Band(slice(0, 0), *whole)
 
         def refine(tile: Tile) -> tuple[PixelIndices, Float32Array, Float32Array]:
@@ -252,10 +252,8 @@ class NetworkRefiner:
         pixels.
         """
         maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
-        rows, places = (
-            tile.rows[tile.mask],
-            torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device),
-        )
+        rows = tile.rows[tile.mask]
+        places = torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
         for part in slices(len(rows), LIT_AT_ONCE):
             maps.view(-1, columns)[places[part]] = values_of(
                 rows[part], lighting_at(rows[part]), part
