@@ -260,17 +260,8 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
             channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path)
-    names = (
-        "Z",
-        "Y",
-        "R",
-        "V",
-        "depth.Z",
-        "RGB",
-        "RGBA",
-        *channels,
-    )  # names of a depth, then any other
-    name = next((name for name in names if name in channels), None)
-    if name is None:
-        raise InputError("the EXR file has no channel", path)
-    return np.asarray(channels[name].pixels)
+    # The names of a depth, then any other.
+    for channel in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):
+        if channel in channels:
+            return np.asarray(channels[channel].pixels)
+    raise InputError("the EXR file has no channel", path)
