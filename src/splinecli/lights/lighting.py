@@ -39,9 +39,8 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
-        points = (
-            np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
-        )
+        points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1)
+        points = points * lamps.pixel_size
     else:
         rays = rays_at(rows, columns, lamps.camera_matrix)
         points = rays * (depth * _plane_distance(lamps))[:, None] + _camera_position(lamps)
@@ -298,9 +297,8 @@ def _exposure(
     exposure = float(seen @ gathered / (gathered @ gathered))
     # If gathered and ambient light are more alike, they cannot be separated.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
-        with_ambient, ambient = np.linalg.lstsq(
-            np.stack((gathered, albedo), axis=1), seen, rcond=None
-        )[0]
+        design = np.stack((gathered, albedo), axis=1)
+        with_ambient, ambient = np.linalg.lstsq(design, seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
 

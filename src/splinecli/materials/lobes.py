@@ -43,12 +43,12 @@ class Geometry(NamedTuple):
 
         z points to the camera.
         """
-        n_dot_l = (
-            normals @ lights.T if lights.ndim == 2 else torch.einsum("pfc,pc->pf", lights, normals)
-        )
-        return cls(
-            n_dot_l, normals[:, 2:].clamp(min=LEAST_Z), lights[..., 2], normal_error[:, None]
-        )
+        if lights.ndim == 2:
+            n_dot_l = normals @ lights.T
+        else:
+            n_dot_l = torch.einsum("pfc,pc->pf", lights, normals)
+        n_dot_v = normals[:, 2:].clamp(min=LEAST_Z)
+        return cls(n_dot_l, n_dot_v, lights[..., 2], normal_error[:, None])
 
 
 def diffuse_lobe(geometry: Geometry, minnaert: Tensor) -> Tensor:
@@ -183,9 +183,8 @@ def fit_base(
     weights = sample.lit / (2 * _RELATIVE * observed + floor) ** 2
     for _ in range(_STEPS):
         above = (weights * slope * (observed - offset)).sum(1, keepdim=True) + pulled
-        base = (
-            above / ((weights * slope * slope).sum(1, keepdim=True) + pull).clamp(min=1e-12)
-        ).clamp(min=0)
+        below = (weights * slope * slope).sum(1, keepdim=True) + pull
+        base = (above / below.clamp(min=1e-12)).clamp(min=0)
         radiance = base * slope + offset
         variance = (
             (_RELATIVE * radiance) ** 2 + (lobe_error * (base * of_facets + offset)) ** 2 + floor**2

@@ -78,9 +78,8 @@ def encode_picture(
 
 def describe(convention: Convention) -> str:
     """Return the text to write into normal map files: the frame, and the direction of green."""
-    return (
-        f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
-    )
+    green = "up" if convention == "opengl" else "down"
+    return f"x right, y up, z to the camera; green is y {green}"
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> Float64Array:
@@ -117,10 +116,8 @@ def angular_error_map_deg(normals: Floats, ground_truth: Floats, mask: Bools) ->
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
     # Row by row, because a map of many megapixels in float64 would need several gigabytes.
-    for row, row_scored, row_normals, row_truth in zip(
-        errors, scored, normals, ground_truth, strict=True
-    ):
-        row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
+    for row, chosen in enumerate(scored):
+        errors[row, chosen] = angle_between_deg(normals[row, chosen], ground_truth[row, chosen])
     return errors
 
 
@@ -196,6 +193,5 @@ def _derivatives(
     of_right = moment(inner, 0, 1) / weight - value * right
     of_down = moment(inner, 1, 0) / weight - value * down
     determinant = np.maximum(rr * dd - rd**2, least**2)
-    return (dd * of_right - rd * of_down) / determinant, -(
-        rr * of_down - rd * of_right
-    ) / determinant
+    to_right, to_down = dd * of_right - rd * of_down, rr * of_down - rd * of_right
+    return to_right / determinant, -to_down / determinant

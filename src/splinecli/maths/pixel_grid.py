@@ -149,10 +149,8 @@ class Blocks:
         """
         if camera_matrix is None:
             return None
-        shrunk = (
-            np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
-        )
-        return shrunk @ camera_matrix
+        shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step)))
+        return shrunk / self.step @ camera_matrix
 
     def interpolate(self, depth: Floats, mask: Bools) -> Floats:
         """Return the depths (P,) of the pixels of a mask (H, W) from the depths of the blocks (h,

@@ -271,10 +271,10 @@ def cgroup_quotas() -> list[float]:
         # first is "max" or -1 without a quota.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
-                quota, period = " ".join(
-                    (folder / name).read_text("utf-8") for name in names
-                ).split()
-                quotas += [] if quota in ("max", "-1") else [float(quota) / float(period)]
+                content = " ".join((folder / name).read_text("utf-8") for name in names)
+                quota, period = content.split()
+                if quota not in ("max", "-1"):
+                    quotas.append(float(quota) / float(period))
     return quotas
 
 

@@ -203,12 +203,10 @@ class NewFiles:
                 self.hidden[name] = Path(file.name)
                 if isinstance(content, np.ndarray):
                     np.save(file, content, allow_pickle=False)
+                elif isinstance(content, bytes):
+                    file.write(content)
                 else:
-                    file.write(
-                        content
-                        if isinstance(content, bytes)
-                        else content.encode(errors="backslashreplace")
-                    )
+                    file.write(content.encode(errors="backslashreplace"))
             sync(self.hidden[name])
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:

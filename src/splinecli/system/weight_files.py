@@ -48,9 +48,8 @@ def read_tensors(
             raise ModelError("no such file", path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
-            if (
-                length := int.from_bytes(start.read(LENGTH_BYTES), "little")
-            ) > 1 << 20:  # a tensor takes about 100
+            length = int.from_bytes(start.read(LENGTH_BYTES), "little")
+            if length > 1 << 20:  # a tensor takes about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}

@@ -110,9 +110,8 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
         # than the picture. Empty parts have up to 2^16 bytes, such as the tables of a JPEG, and
         # tiles up to 2^24 more than the picture.
         expanded = math.prod(page.chunks) * page.dtype.itemsize
-        if expanded > 2 * page.nbytes + (1 << 24) or max(
-            page.databytecounts, default=0
-        ) > 2 * expanded + (1 << 16):
+        longest = max(page.databytecounts, default=0)
+        if expanded > 2 * page.nbytes + (1 << 24) or longest > 2 * expanded + (1 << 16):
             raise ValueError
         size = os.fstat(file.fileno()).st_size
         parts = zip(page.dataoffsets, page.databytecounts, strict=True)

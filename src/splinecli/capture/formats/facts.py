@@ -219,27 +219,18 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
         except zlib.error:
             profile = b""
     # 100000 times the exponent of the encoding: 1 means linear.
-    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (
-        0,
-        100_000,
-    )
+    gamma = int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big")
+    encoded = b"sRGB" in chunks or gamma not in (0, 100_000)
     curve = _curve(_ENCODED if encoded else StatedCurve(), profile)
     if b"cICP" in chunks:
-        curve = _CODE_POINTS.get(
-            int.from_bytes(chunks[b"cICP"][1:2], "big"), StatedCurve(unread=True)
-        )
+        code = int.from_bytes(chunks[b"cICP"][1:2], "big")
+        curve = _CODE_POINTS.get(code, StatedCurve(unread=True))
     # One number for each channel. Alpha, if there is one, comes last.
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
-    return ImageHeader(
-        path,
-        "PNG",
-        size,
-        curve,
-        level,
-        _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
-    )
+    exif = _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b"")))
+    return ImageHeader(path, "PNG", size, curve, level, exif)
 
 
 def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:

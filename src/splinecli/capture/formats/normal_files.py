@@ -111,9 +111,8 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     filled = (values != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
     upside_down = bool(turned - as_stored > 0.02 * np.count_nonzero(mask))
-    return _to_normals(
-        _Stored(values[::-1] if upside_down else values, None, False), mask, path
-    ), upside_down
+    stored = _Stored(values[::-1] if upside_down else values, None, False)
+    return _to_normals(stored, mask, path), upside_down
 
 
 def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:

@@ -89,11 +89,8 @@ def columns(count: int) -> str:
 
 def has_decimal_commas(text: str) -> bool:
     """Return whether a line looks like numbers with decimal commas, such as "0,5 0,3 0,8"."""
-    return (
-        "." not in text
-        and re.search(r"\d,\d", text) is not None
-        and re.search(r"[\s;]", text) is not None
-    )
+    has_both = re.search(r"\d,\d", text) and re.search(r"[\s;]", text)
+    return "." not in text and has_both is not None
 
 
 def check_text_length(path: Path, most: int, expected: str = "a text file") -> None:
@@ -207,11 +204,10 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
     """Return the words of a line, with points for decimal commas."""
     separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
     words = [word for word in separators.split(text) if word]
-    if not decimal_commas:
-        return words
-    return [
-        word.replace(",", ".") if _NUMBER_WITH_COMMA.fullmatch(word) else word for word in words
-    ]
+    if decimal_commas:
+        is_number = _NUMBER_WITH_COMMA.fullmatch
+        return [word.replace(",", ".") if is_number(word) else word for word in words]
+    return words
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:

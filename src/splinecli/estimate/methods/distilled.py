@@ -132,7 +132,7 @@ BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 # decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
-_MOMENTUM, _SQUARES = (0.9, 0.99)
+_MOMENTUM, _SQUARES = 0.9, 0.99
 _ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 
@@ -262,12 +262,9 @@ class Perceptron(nn.Module):
             )
             mean.lerp_(gradient, 1 - _MOMENTUM)
             square.lerp_(gradient.square_(), 1 - _SQUARES)
-            rate = (
-                _LEARNING_RATE
-                * _rate_share(step / steps)
-                * math.sqrt(1 - _SQUARES**step)
-                / (1 - _MOMENTUM**step)
-            )
+            rate = _LEARNING_RATE * _rate_share(step / steps)
+            rate *= math.sqrt(1 - _SQUARES**step)
+            rate /= 1 - _MOMENTUM**step
             values.addcdiv_(mean, square.sqrt().add_(1e-8), value=-rate)
             progress()
 

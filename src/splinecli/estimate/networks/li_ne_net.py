@@ -213,9 +213,8 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            self.linear.bias[
-                1
-            ] = -3.5  # initial value of the logarithm of the median error in radians
+            # initial value of the logarithm of the median error in radians
+            self.linear.bias[1] = -3.5
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
         """Return the adjusted distributions (P, 2) of the errors (P, 2), from features of the
@@ -374,9 +373,9 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.zero_()[0] = 1
-        self.join = (
-            nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
-        )
+        self.join: nn.Linear | None = None
+        if config.set_width:
+            self.join = nn.Linear(config.set_width, head_width, bias=False)
         self.error_head = ErrorHead(head_width, fits + 2) if config.error_head else None
 
     def forward(

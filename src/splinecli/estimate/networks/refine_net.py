@@ -153,11 +153,9 @@ class RefineNet(nn.Module):
         border = (0, -width % COARSEST, 0, -height % COARSEST)
         # The data type of the layers. In training, the sums over the blocks stay in float32.
         device = features.device.type
-        layers = (
-            torch.get_autocast_dtype(device)
-            if torch.is_autocast_enabled(device)
-            else features.dtype
-        )
+        layers = features.dtype
+        if torch.is_autocast_enabled(device):
+            layers = torch.get_autocast_dtype(device)
         stream = features.dtype if torch.is_grad_enabled() else layers
         masks = [pad(mask, border).to(layers)]
         for _ in self.down:

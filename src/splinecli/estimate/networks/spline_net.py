@@ -135,9 +135,8 @@ class SplineNet(nn.Module):
         # normal.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
-        angle = (
-            torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
-        )
+        turn_deg = torch.as_tensor(rotation.turn_deg, device=azimuth.device)
+        angle = turn_deg * (math.pi / 180) - azimuth
         cosine, sine = angle.cos(), angle.sin()
         lights = rotate_about_view_axis(
             light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
@@ -181,10 +180,7 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             dense: Tensor = self.li_net(maps.sparse)
         else:
-            inputs = torch.cat(
-                (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map), dim=1
-            )
-            dense = maps.lambertian_map + self.li_net(inputs)
+            dense = maps.lambertian_map + self.li_net(torch.cat(maps[:4], dim=1))
         return dense * self.inside
 
     def estimate(
@@ -205,14 +201,12 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
         else:
-            channels = (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map)
             normals, features = _starting_normals(maps), None
             if self.set_branch is not None:
                 features, fitted, _ = self._read_set(maps, normals, captures, context)
                 normals = torch.cat((normals, fitted[:, None]), dim=1)
-            raw, error = self.ne_net(
-                torch.cat((*channels, *interpolated), dim=1), normals, features
-            )
+            channels = torch.cat((*maps[:4], *interpolated), dim=1)
+            raw, error = self.ne_net(channels, normals, features)
         return Estimate(normalize(raw.float(), dim=-1), error)
 
     def forward(
@@ -267,12 +261,10 @@ class SplineNet(nn.Module):
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
         tokens, fitted, found = self._read_set(maps, _starting_normals(maps), captures, context)
-        count = (
-            torch.full_like(maps.scale, observations.shape[1])
-            if valid is None
-            else valid.sum(1, keepdim=True)
-        )
-        return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count.to(maps.scale)), found
+        count = torch.full_like(maps.scale, observations.shape[1])
+        if valid is not None:
+            count = valid.sum(1, keepdim=True).to(count)
+        return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count), found
 
     def _read_set(
         self, maps: PixelMaps, normals: Tensor, captures: int, context: CaptureContext | None
