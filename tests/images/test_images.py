@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError
 from splinecli.images.saturation import (
     Saturation,
@@ -170,7 +170,7 @@ def test_a_given_level_is_used_as_it_is() -> None:
 
 
 def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) -> float:
-    capture = prepare_capture(open_capture(folder, **settings))
+    capture = prepare_capture(open_capture(folder, CaptureOptions(**settings)))
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 

@@ -337,9 +337,8 @@ def _prepare(folder: Path, options: InferOptions, clock: Clock) -> Work:
     n_reads = images_to_read(work)
     seconds = partial(
         expected_seconds,
-        n_images=len(work.indices),
-        n_reads=n_reads,
-        image_pixels=height * width,
+        image_pixels=len(work.indices) * height * width,
+        read_pixels=n_reads * height * width,
         network=options.method.startswith(DEFAULT_METHOD),
         align=options.align,
         maps=chosen_maps(options.maps, page=options.html),

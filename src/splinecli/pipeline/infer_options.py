@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from msgspec import Meta
 
-from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
+from splinecli.capture import CaptureOptions, CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
 from splinecli.capture.light_files import light_suffixes
@@ -492,19 +492,21 @@ class Reading(Record, frozen=True, kw_only=True):
         """Open the capture in the folder with these options. Raises InputError."""
         return open_capture(
             folder,
-            lights=self.light_file,
-            intensities=self.intensities,
-            mask=self.mask,
-            ground_truth=self.ground_truth,
-            radiometry=self.radiometric_calibration(),
-            white_level=self.white_level,
-            light_frame=parse_light_frame(self.light_frame),
-            lights_format=self.light_format,
-            lamps=self.lamps,
-            window=parse_window(self.crop, self.scale),
-            needs_lights=not self.finds_lights,
-            lights_in_channels=self.lights_in_channels,
-            crosstalk=self.crosstalk,
+            CaptureOptions(
+                lights=self.light_file,
+                intensities=self.intensities,
+                mask=self.mask,
+                ground_truth=self.ground_truth,
+                radiometry=self.radiometric_calibration(),
+                white_level=self.white_level,
+                light_frame=parse_light_frame(self.light_frame),
+                light_format=self.light_format,
+                lamps=self.lamps,
+                window=parse_window(self.crop, self.scale),
+                needs_lights=not self.finds_lights,
+                lights_in_channels=self.lights_in_channels,
+                crosstalk=self.crosstalk,
+            ),
         )
 
 

@@ -209,9 +209,8 @@ def _report(work: Work) -> dict[str, Any]:
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
     stages = expected_seconds(
         capture.n_pixels,
-        len(images),
-        height * width,
-        n_reads=images_to_read(work),
+        len(images) * height * width,
+        read_pixels=images_to_read(work) * height * width,
         align=work.options.align,
     )
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network

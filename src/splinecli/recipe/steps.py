@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splinecli.capture.linearise import StoredPixels
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
@@ -314,7 +314,7 @@ def prepare_capture(
     Raises the errors of `begin` and of the steps.
 
     Examples:
-        >>> from splinecli.capture import open_capture
+        >>> from splinecli.capture import CaptureOptions, open_capture
         >>> from splinecli.recipe.steps import prepare_capture
         >>> capture = prepare_capture(open_capture("examples/medallion"), [0, 2, 4])
         >>> capture.observations.shape, capture.light_directions.shape
@@ -341,6 +341,9 @@ def read_capture(
         10
     """
     source = open_capture(
-        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        folder,
+        CaptureOptions(
+            lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        ),
     )
     return prepare_capture(source, light_indices, RecipeOptions(as_stored=as_stored))
