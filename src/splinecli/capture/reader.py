@@ -186,7 +186,8 @@ def _find_files(
             hint = "Leave it out, or use --light-distance with a file of directions"
             raise UsageError(problem, hint=hint)
         overrides, form = replace(overrides, lights=near.positions), "positions"
-    if near is not None and near.object_width is not None and options.window.box is not None:
+    has_width = near is not None and near.options.object_width is not None
+    if has_width and options.window.box is not None:
         raise UsageError(
             "--object-width needs the whole object in the image",
             hint="Give --pixel-size beside --crop",

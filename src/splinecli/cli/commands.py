@@ -171,8 +171,8 @@ def import_weights(options: ImportOptions) -> None:
             "exists already", path=output, hint="Add --overwrite, or choose another place with -o"
         )
 
-    from splinecli.estimate.networks.weights import save_weights
     from splinecli.workshop.import_weights import import_official
+    from splinecli.workshop.save_weights import save_weights
 
     save_weights(import_official(options.li_net, options.ne_net), output)
     if not options.quiet:

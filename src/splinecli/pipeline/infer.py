@@ -25,7 +25,7 @@ from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
-from splinecli.estimate.methods.estimator import FEWEST_PIXELS, student_sizes
+from splinecli.estimate.methods.estimator import FEWEST_TO_DISTIL, student_sizes
 from splinecli.judge.checks import check_confidence, refuse_if_strict
 from splinecli.lights.draws import draw_lights
 from splinecli.pictures.maps import encode_png
@@ -138,7 +138,7 @@ def distil_for(
             f"method {estimator.name} does not provide confidence and cannot be distilled"
         )
     sizes = student_sizes(capture.n_pixels)
-    if sizes[0].sample < FEWEST_PIXELS:
+    if sizes[0].sample < FEWEST_TO_DISTIL:
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
     teacher = estimator.bind(lighting_at, capture.mask)

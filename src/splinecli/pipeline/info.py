@@ -9,7 +9,7 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.channel_lights import CHANNELS
-from splinecli.capture.light_files import check_writable, encode_lights
+from splinecli.capture.light_files import encode_lights, light_encoder
 from splinecli.errors import UsageError
 from splinecli.judge.light_check import candidate_rows
 from splinecli.lights.calibration.balls import find_view
@@ -192,7 +192,7 @@ def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
             raise UsageError(problem, hint="Choose another folder for it")
         check_free(plot.parent, [plot.name], overwrite=options.overwrite)
     if mended_lights is not None:
-        check_writable(mended_lights)
+        light_encoder(mended_lights)
         if source.lamps is not None and source.lamps.used:
             raise UsageError("--mended-lights writes directions, but the lights are near lamps")
         check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor, nn
 
 from splinecli.estimate.networks.config import NetworkConfig
-from splinecli.estimate.networks.spline_net import SplineNet, to_pixel_frame
+from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.maths.observation_map import cell_directions, sparse_map
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
@@ -27,6 +27,7 @@ from splinecli.workshop.training.objective import (
     dense_truth_in_frame,
     map_loss,
     mirror,
+    to_pixel_frame,
 )
 from tiny_networks import random_network
 

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from splinecli.errors import ModelError, UsageError
-from splinecli.estimate.networks.refine_net import CHANNELS
+from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import load_weights, resolve_weights, save_weights
+from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.whole_capture import photograph_scene
 from splinecli.workshop.training import WEIGHTS, refinement, tasks
@@ -217,7 +218,7 @@ def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> No
         return made
 
     one, again, other = pool(1).examples[0], pool(1).examples[0], pool(2).examples[0]
-    assert one.features.shape == (CHANNELS, 26, 26), "with the dark margin"
+    assert one.features.shape == (FEATURE_CHANNELS, 26, 26), "with the dark margin"
     assert torch.equal(one.features, again.features)
     assert not torch.equal(one.features, other.features)
     drawn = pool(1).draw(3, torch.Generator().manual_seed(0))
@@ -266,7 +267,7 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: Trai
         return torch.nn.functional.normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
 
     def losses_of(estimate: torch.Tensor) -> list[float]:
-        features = torch.zeros(1, CHANNELS, 24, 24)
+        features = torch.zeros(1, FEATURE_CHANNELS, 24, 24)
         features[0, :3] = estimate
         maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))
         return [

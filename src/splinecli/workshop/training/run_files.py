@@ -29,9 +29,9 @@ from splinecli.system.weight_files import (
     load_strictly,
     read_json_entry,
     read_tensors,
-    serialise,
     tensors_sha256,
 )
+from splinecli.workshop.save_weights import serialise
 from splinecli.workshop.training import EVENTS, METRICS
 from splinecli.workshop.training.config import TrainingConfig
 from splinecli.workshop.training.tasks import SampleMaps
