@@ -144,8 +144,8 @@ def prepare(options: PrepareOptions) -> int:
     summary = prepare_pixel_set(options, Messages(quiet=options.quiet))
     in_words = (
         f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes,"
-        f" {summary['n_pixels']} pixels,"
-        f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"
+        f" {summary['n_pixels']} pixels, {summary['bytes'] / 1e6:.0f} MB; overview in"
+        f" {summary['contact_sheet']}"
     )
     print_report(
         summary,

@@ -101,8 +101,8 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
             problem = (
-                f"{other} and {folder} have the same name, so their results would overwrite"
-                " each other"
+                f"{other} and {folder} have the same name, so their results would overwrite each"
+                " other"
             )
             raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]

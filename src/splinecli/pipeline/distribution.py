@@ -392,8 +392,8 @@ class Distributor:
             last = getattr(error.last_worker, "address", error.last_worker)
             problem = f"its worker was lost {error.allowed_failures + 1} times, the last one {last}"
             hint = (
-                "If there was too little memory, start fewer workers on each machine, or"
-                " make the images smaller"
+                "If there was too little memory, start fewer workers on each machine, or make the"
+                " images smaller"
             )
             result = LostError(problem, path=item.name, hint=hint)
         del self.running[future]

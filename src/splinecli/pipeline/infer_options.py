@@ -162,8 +162,7 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
             "Processes and machines",
             "ADDRESS|FILE",
             "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
-            " its scheduler file (needs"
-            " the extra 'cluster').",
+            " its scheduler file (needs the extra 'cluster').",
             names=("--cluster",),
         ),
     ] = None
@@ -267,8 +266,7 @@ class Reading(Record, frozen=True, kw_only=True):
             "Lights",
             "FILE|estimate",
             f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
-            " estimate derives them from the"
-            " images, less accurately than a calibration.",
+            " estimate derives them from the images, less accurately than a calibration.",
             default="the light file in CAPTURE",
         ),
     ] = None
@@ -278,9 +276,8 @@ class Reading(Record, frozen=True, kw_only=True):
             "Lights",
             "SIDE|DEGREES",
             "With --lights estimate: the side that the first light comes from, such as left, above"
-            " or upper-left, or its"
-            " azimuth, counter-clockwise from the right. Needed if the images show no outline of"
-            " the object.",
+            " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
+            " images show no outline of the object.",
             complete=tuple(SIDES_DEG),
         ),
     ] = None
@@ -301,8 +298,7 @@ class Reading(Record, frozen=True, kw_only=True):
             "Lights",
             "",
             "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
-            " slant-tilt, the angles of"
-            " HALCON. Angles are in degrees.",
+            " slant-tilt, the angles of HALCON. Angles are in degrees.",
         ),
     ] = "xyz"
     intensities: Annotated[
@@ -320,8 +316,7 @@ class Reading(Record, frozen=True, kw_only=True):
             "Lights",
             "",
             "The channels of each colour image are photographs under three coloured lamps; the"
-            " light file has three lights"
-            " for each image, in the order R, G, B. For gray objects.",
+            " light file has three lights for each image, in the order R, G, B. For gray objects.",
         ),
     ] = False
     crosstalk: Annotated[
@@ -372,8 +367,7 @@ class Reading(Record, frozen=True, kw_only=True):
             "Lights",
             "FILE",
             "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
-            " is then estimated in the"
-            " frame of its viewing ray.",
+            " is then estimated in the frame of its viewing ray.",
             default="camera_matrix.txt in CAPTURE, or orthographic",
         ),
     ] = None
@@ -525,9 +519,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         Option(
             "Lights",
             "S",
-            "Near lamps: the width of a pixel on the object, in the unit of the lamps."
-            " With --surface: in millimetres, for"
-            " a surface in millimetres.",
+            "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
+            " --surface: in millimetres, for a surface in millimetres.",
             default="pixel_size.txt in CAPTURE",
         ),
     ] = None
@@ -561,8 +554,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
             "Speed",
             "",
             "Approximate the network with a smaller one, trained on a sample of the capture's"
-            " pixels, or use the method on"
-            " every pixel.",
+            " pixels, or use the method on every pixel.",
             default="--distil from 100,000 pixels, else --exact",
             names=("--distil/--exact",),
         ),
@@ -578,8 +570,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
             "Output",
             "LIST",
             f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
-            " 8, npy and tiff are"
-            " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.",
+            " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
+            " written as EXR, too.",
             names=("--format",),
             items=NORMALS,
         ),
@@ -590,9 +582,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
             "Output",
             "LIST",
             f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
-            " relief:2 makes heights"
-            " of 2 pixels white in the picture, and curvature:0.1 a mean curvature of 0.1 per"
-            " pixel.",
+            " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
+            " curvature of 0.1 per pixel.",
             items=MAPS,
         ),
     ] = ()

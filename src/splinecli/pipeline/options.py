@@ -113,8 +113,8 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
             "Light intensities",
             "",
             "The images of the gray ball are colour images under three coloured lamps at once:"
-            " measure the crosstalk."
-            " BALL then contains one image under each lamp alone, in the order R, G, B.",
+            " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
+            " order R, G, B.",
         ),
     ] = False
     transfer: Annotated[
@@ -249,11 +249,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
             "Input",
             "FILE",
             "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
-            " overall shape from"
-            " it, and the detail from the normals. .npy, .tif or .exr, with heights towards the"
-            " camera in the unit"
-            " of the result, or with depths in millimetres for a perspective camera. NaN is"
-            " unknown.",
+            " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
+            " heights towards the camera in the unit of the result, or with depths in millimetres"
+            " for a perspective camera. NaN is unknown.",
         ),
     ] = None
     discontinuity: Annotated[
@@ -306,8 +304,7 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
             "Output",
             "LIST",
             f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
-            " or as a 16-bit"
-            " picture (png). exr needs the extra 'exr'.",
+            " or as a 16-bit picture (png). exr needs the extra 'exr'.",
             names=("--format",),
             items=SURFACE_FILES,
         ),
@@ -503,8 +500,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
             "Output",
             "",
             "Estimate normals and material from the first draw of each capture, render the capture"
-            " under its other lights,"
-            " and compare with the photographs.",
+            " under its other lights, and compare with the photographs.",
         ),
     ] = False
     output: Annotated[FileName, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = (

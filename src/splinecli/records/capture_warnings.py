@@ -68,8 +68,7 @@ BLACK_PIXELS = WarningKind(
 CONSTANT_LIGHT = WarningKind(
     "constant_light",
     "The images look as if they contained [ambient"
-    " light](input-checks.md#other-interpretations-of-the-images) or a "
-    "black level",
+    " light](input-checks.md#other-interpretations-of-the-images) or a black level",
     "`--ambient IMAGE`, taken with all lamps off",
     severity="error",
 )
@@ -153,8 +152,7 @@ IMAGE_INCONSISTENT = WarningKind(
 IMAGE_SCALE = WarningKind(
     "image_scale",
     "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit"
-    " image among "
-    "16-bit ones",
+    " image among 16-bit ones",
     "Save all images with the same bit depth",
     severity="error",
 )
@@ -208,8 +206,7 @@ LIGHTS_ILL_CONDITIONED = WarningKind(
 LIGHTS_IN_CHANNELS = WarningKind(
     "lights_in_channels",
     "The channels are read as images under three lamps, as `--lights-in-channels` requests;"
-    " coloured objects get wrong "
-    "normals",
+    " coloured objects get wrong normals",
     "A [crosstalk matrix](coloured-lights.md), and gray objects",
 )
 LIGHTS_MATCHED = WarningKind(
@@ -223,8 +220,7 @@ LIGHTS_NEAR_AXIS = WarningKind(
 LIGHTS_UNCHECKED = WarningKind(
     "lights_unchecked",
     "Shadows that the lights should cast are missing; with `--strict`, also if the order or the"
-    " frame of the "
-    "lights [cannot be checked](input-checks.md#wrong-light-directions)",
+    " frame of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
 )
 LOW_CONFIDENCE = WarningKind(
@@ -236,8 +232,7 @@ LOW_CONFIDENCE = WarningKind(
 MASK_CHOICE = WarningKind(
     "mask_choice",
     "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the"
-    " images, is used as "
-    "the mask; if there are several such pictures, they are ignored",
+    " images, is used as the mask; if there are several such pictures, they are ignored",
     "`--mask FILE` for another one",
 )
 MASK_INVERTED = WarningKind(
@@ -265,8 +260,8 @@ NO_MASK = WarningKind(
 )
 NONLINEARITY_SUSPECTED = WarningKind(
     "nonlinearity_suspected",
-    "The images [look encoded](input-checks.md#other-interpretations-of-the-images),"
-    " but are read as linear",
+    "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read"
+    " as linear",
     "`--transfer srgb` or `gamma:2.2`",
     severity="error",
 )
@@ -302,8 +297,7 @@ ROUGH_LIGHTS = WarningKind(
 ROUGHNESS_UNDETERMINED = WarningKind(
     "roughness_undetermined",
     "With `--maps material`: there are too few highlights, or the normals are too uncertain, to"
-    " [determine the "
-    "roughness](materials.md#limits)",
+    " [determine the roughness](materials.md#limits)",
     "Add lights, some of them near the camera axis",
 )
 SATURATED = WarningKind(
@@ -355,7 +349,6 @@ def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
     return CaptureWarning(
         ESTIMATED_LIGHTS,
         "The light directions were estimated from the images. Their expected error is"
-        f" {errors_deg.mean():.0f} degrees"
-        f" on average and {errors_deg.max():.0f} degrees for the worst one; the normals inherit"
-        " these errors.",
+        f" {errors_deg.mean():.0f} degrees on average and {errors_deg.max():.0f} degrees for the"
+        " worst one; the normals inherit these errors.",
     )

@@ -299,9 +299,8 @@ def json_schema() -> dict[str, Any]:
     )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Documents of splinecli: report.json, surface.json, results.json, and"
-        " the document that replaces them"
-        " after a failure",
+        "title": "Documents of splinecli: report.json, surface.json, results.json, and the"
+        " document that replaces them after a failure",
         "anyOf": list(references),
         "$defs": parts,
     }

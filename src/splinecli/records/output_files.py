@@ -136,9 +136,8 @@ _ROWS = (
     # the colours of two images, sums and the map
     OutputMap(
         name="albedo",
-        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3,"
-        " linear RGB, up to a factor."
-        " The picture is 8-bit sRGB, the EXR file float16",
+        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear"
+        " RGB, up to a factor. The picture is 8-bit sRGB, the EXR file float16",
         unit="linear RGB",
         suffixes=("npy", "exr", "png"),
         caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
@@ -148,12 +147,11 @@ _ROWS = (
     ),
     OutputMap(
         name="confidence",
-        content="the probability that a normal has an error of at most 5 degrees; float32,"
-        " H x W, zero outside the"
-        " mask; white is 1",
+        content="the probability that a normal has an error of at most 5 degrees; float32, H x W,"
+        " zero outside the mask; white is 1",
         suffixes=("npy", "png"),
-        caption="Confidence: the probability that the normal is at most 5° off, from 0"
-        " (black) to 1 (white)",
+        caption="Confidence: the probability that the normal is at most 5° off, from 0 (black) to"
+        " 1 (white)",
         needs_confidence=True,
     ),
     OutputMap(
@@ -169,20 +167,18 @@ _ROWS = (
     ),
     OutputMap(
         name="curvature",
-        content="mean and Gaussian curvature from the normals, filtered with 2 pixels;"
-        " float32, H x W x 2, in 1/pixel"
-        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature:"
-        " gray is 0, white 0.05 per pixel",
+        content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H"
+        " x W x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the"
+        " mean curvature: gray is 0, white 0.05 per pixel",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
         scale=0.05,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
     ),
     OutputMap(
         name="relief",
-        content="heights without the overall shape; float32, H x W, in pixels, NaN outside"
-        " the mask. The high-pass"
-        " filter halves the amplitude of 64-pixel wavelengths. In the picture,"
-        " gray is 0 and white 1 pixel",
+        content="heights without the overall shape; float32, H x W, in pixels, NaN outside the"
+        " mask. The high-pass filter halves the amplitude of 64-pixel wavelengths. In the"
+        " picture, gray is 0 and white 1 pixel",
         unit="heights in pixels",
         scale=1.0,
         scale_text="height, black -{scale}, gray 0, white {scale} pixels",
@@ -190,11 +186,9 @@ _ROWS = (
     ),
     OutputMap(
         name="material",
-        content="base colour, roughness, metalness, specular reflection and their"
-        " confidence; float32,"
-        " zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
-        " and glTF's texture with roughness in"
-        " green and metalness in blue",
+        content="base colour, roughness, metalness, specular reflection and their confidence;"
+        " float32, zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
+        " and glTF's texture with roughness in green and metalness in blue",
         reads_images=True,
         bytes_per_pixel=170,  # the maps, and the gloss of each pixel
         bytes_per_observation=5,

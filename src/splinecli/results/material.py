@@ -116,12 +116,9 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
     if facts.determined < _LEAST_DETERMINED:
         text = (
             f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have"
-            " a confidence of"
-            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain."
-            " roughness.npy has the most"
-            f" likely values, {facts.median_roughness:.2f} in the median. Add lights, some near"
-            " the camera"
-            " axis."
+            f" a confidence of {_CONFIDENT} or more. Highlights are too few, or the normals too"
+            f" uncertain. roughness.npy has the most likely values, {facts.median_roughness:.2f}"
+            " in the median. Add lights, some near the camera axis."
         )
         warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
     return warnings

@@ -315,9 +315,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         circle = ball["circle"]
         lines.append(
             f"{ball['folder']}: circle {circle['x']:.1f}, {circle['y']:.1f}, radius"
-            f" {circle['radius']:.1f} pixels"
-            f" (from {circle['from']}, {100 * circle['seen']:.0f} % of the outline visible,"
-            f" spread {circle['spread']:.1f} pixels)"
+            f" {circle['radius']:.1f} pixels (from {circle['from']}, {100 * circle['seen']:.0f} %"
+            f" of the outline visible, spread {circle['spread']:.1f} pixels)"
         )
     if angles := report["disagreement_deg"]:
         lines.append(
@@ -346,10 +345,8 @@ def _warnings(
 ) -> list[str]:
     warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain"
-        f" ({100 * ball.circle.visible:.0f} % of it visible,"
-        f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green"
-        " circle is wrong, give --mask or"
-        " --circle."
+        f" ({100 * ball.circle.visible:.0f} % of it visible, spread {ball.circle.spread:.1f}"
+        f" pixels). Check {picture}; if the green circle is wrong, give --mask or --circle."
         for ball in lights.balls
         # Less of the outline is visible, or it varies by more than 1 % of the radius.
         if ball.circle.visible < 0.6 or ball.circle.spread > 0.01 * ball.circle.radius
@@ -357,21 +354,18 @@ def _warnings(
     if lamps is not None and not lamps.known:
         warnings.append(
             "The rays from the balls are too parallel to measure the lamps' distances. If the"
-            " lamps are near, put the"
-            " balls farther apart."
+            " lamps are near, put the balls farther apart."
             if lamps.view.known
-            else "The lamps' distances are unknown, because the camera is: it is treated"
-            " as distant, which makes"
-            " the rays from the balls too parallel if it is near. If the lamps are near, add"
-            " --camera-matrix."
+            else "The lamps' distances are unknown, because the camera is: it is treated as"
+            " distant, which makes the rays from the balls too parallel if it is near. If the"
+            " lamps are near, add --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
     if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
             f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1}"
-            " (counted from 1)."
-            f" Check {picture}."
+            f" (counted from 1). Check {picture}."
         )
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
@@ -382,8 +376,8 @@ def _warnings(
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of"
-                " the light directions:"
-                " each is half-way between the view and the light. Use the file written here."
+                " the light directions: each is half-way between the view and the light. Use the"
+                " file written here."
             )
     return warnings
 
