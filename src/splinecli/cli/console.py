@@ -38,10 +38,7 @@ _SYNTAX = (
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
 # options of earlier versions
-RENAMED = {
-    "--stiffness": "--discontinuity",
-    "--lights-format": "--light-format",
-}
+RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}
 
 
 def explain(error: Exception) -> tuple[str, int]:

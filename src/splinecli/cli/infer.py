@@ -26,10 +26,7 @@ if TYPE_CHECKING:
     from splinecli.results.pages import Row
 
 # of the last line, for these outcomes
-_WORDS = {
-    "skipped": "already done",
-    "changed": "changed but kept",
-}
+_WORDS = {"skipped": "already done", "changed": "changed but kept"}
 
 
 def infer(

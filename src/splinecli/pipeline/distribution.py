@@ -41,11 +41,7 @@ if TYPE_CHECKING:
 
 
 # a server has to answer as a scheduler
-_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (
-    5.0,
-    6.0,
-    5.0,
-)
+_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (5.0, 6.0, 5.0)
 _LOOK_SECONDS = 0.5  # between two updates of the list of workers
 # item per worker: the working folder and PyTorch's threads are shared by the whole process
 _ONE_AT_A_TIME = Lock()

@@ -11,7 +11,7 @@ import re
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from msgspec import Meta
 
@@ -61,7 +61,8 @@ def complete_weights() -> list[str]:
 
 
 CURVES = ("auto", "linear", "srgb", "gamma:2.2")  # the last is an example
-OUTPUT = ("--output", "-o")
+OUTPUT = "--output -o"
+LEAVE_ONE = "Leave one out"
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 DISCONTINUITY_HELP = "Discontinuity sensitivity of the surface; 0 gives a continuous surface."
 
@@ -69,7 +70,6 @@ AsStored = Annotated[
     bool,
     Option(
         "Input",
-        "",
         "Use the stored values: do not remove lens blur, restore saturated pixels or estimate"
         " light intensities.",
     ),
@@ -78,39 +78,37 @@ WhiteLevel = Annotated[
     Positive | None,
     Option(
         "Input",
-        "N",
         "Stored value from which a pixel is considered saturated.",
-        default="found in the images",
+        "N",
+        "found in the images",
     ),
 ]
-RandomSeed = Annotated[Seed, Option("Lights", "S", "Seed of the random draws.")]
+RandomSeed = Annotated[Seed, Option("Lights", "Seed of the random draws.", "S")]
 RefineLights = Annotated[
-    bool, Option("Lights", "", "Refine rough light directions so that they fit the images better.")
+    bool, Option("Lights", "Refine rough light directions so that they fit the images better.")
 ]
 Weights = Annotated[
     str | None,
     Option(
         "Method",
-        "NAME|FILE",
         "Weights: a shipped name or a file.",
-        default="the method's own",
+        "NAME|FILE",
+        "the method's own",
         complete=complete_weights,
     ),
 ]
 DeviceName = Annotated[
     Device,
-    Option("Speed", "", "Device to compute on. auto is a CUDA GPU if there is one, else the CPU."),
+    Option("Speed", "Device to compute on. auto is a CUDA GPU if there is one, else the CPU."),
 ]
 PrecisionName = Annotated[
     Precision,
-    Option(
-        "Speed", "", "Number format. auto is bfloat16 if the hardware supports it, else float32."
-    ),
+    Option("Speed", "Number format. auto is bfloat16 if the hardware supports it, else float32."),
 ]
-Quiet = Annotated[bool, Option("Output", "", "Print nothing but errors.", names=("--quiet", "-q"))]
-Overwrite = Annotated[bool, Option("Output", "", "Replace earlier results.")]
+Quiet = Annotated[bool, Option("Output", "Print nothing but errors.", names="--quiet -q")]
+Overwrite = Annotated[bool, Option("Output", "Replace earlier results.")]
 Update = Annotated[
-    bool, Option("Output", "", "Compute changed captures again, and skip those that are done.")
+    bool, Option("Output", "Compute changed captures again, and skip those that are done.")
 ]
 
 
@@ -119,9 +117,7 @@ class Display(Record, frozen=True, kw_only=True):
 
     as_json: Annotated[
         bool,
-        Option(
-            "Output", "", "Print one JSON document on stdout, and nothing else.", names=("--json",)
-        ),
+        Option("Output", "Print one JSON document on stdout, and nothing else.", names="--json"),
     ] = False
     quiet: Quiet = False
 
@@ -142,9 +138,9 @@ class Workers(Record, frozen=True, kw_only=True):
         int,
         Option(
             "Processes and machines",
-            "N|auto",
             "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
             " chooses by cores and memory.",
+            "N|auto",
             parse=parse_workers,
         ),
     ] = 1
@@ -160,19 +156,15 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
         str | None,
         Option(
             "Processes and machines",
-            "ADDRESS|FILE",
             "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
             " its scheduler file (needs the extra 'cluster').",
-            names=("--cluster",),
+            "ADDRESS|FILE",
+            names="--cluster",
         ),
     ] = None
     gpu: bool = False  # whether only workers with the Dask resource GPU are used
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.address is not None and self.workers != 1:
-            hint = "Leave --workers out: the cluster has workers of its own"
-            raise UsageError("--workers and --cluster contradict each other", hint=hint)
+    CONFLICTS = (("workers", "address", "Leave --workers out: the cluster has workers of its own"),)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
         """Return these options with 0 replaced by one process per core, limited to one process per
@@ -199,45 +191,39 @@ class Reading(Record, frozen=True, kw_only=True):
 
     mask: Annotated[
         FileName | None,
-        Option(
-            "Input",
-            "FILE",
-            MASK_IMAGE.format("object"),
-            default="a file named mask.*, or all pixels",
-        ),
+        Option("Input", MASK_IMAGE.format("object"), "FILE", "a file named mask.*, or all pixels"),
     ] = None
     crop: Annotated[
         str | None,
         Option(
             "Input",
-            "X,Y,W,H",
             "Read this box of the images: upper left corner and size, in pixels.",
+            "X,Y,W,H",
         ),
     ] = None
     scale: Annotated[
         str | None,
-        Option("Input", "1/N", "Read every N-th row and column, for a first look.", default="all"),
+        Option("Input", "Read every N-th row and column, for a first look.", "1/N", "all"),
     ] = None
     align: Annotated[
         bool,
         Option(
             "Input",
-            "",
             "Align the images to the first one, if they were shifted, rotated or zoomed between"
             " exposures.",
         ),
     ] = False
     ground_truth: Annotated[
         FileName | None,
-        Option("Input", "FILE", "True normals to compare with (.mat, .npy, text, PNG, TIFF)."),
+        Option("Input", "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"),
     ] = None
     transfer: Annotated[
         str,
         Option(
             "Input",
-            "CURVE",
             "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
             " and reads JPEG as sRGB.",
+            "CURVE",
             complete=CURVES,
         ),
     ] = AUTOMATIC
@@ -245,18 +231,18 @@ class Reading(Record, frozen=True, kw_only=True):
         FileName | None,
         Option(
             "Input",
-            "FILE",
             "Image taken without the lights, to subtract from all images.",
-            default="ambient.*",
+            "FILE",
+            "ambient.*",
         ),
     ] = None
     flat_field: Annotated[
         FileName | None,
         Option(
             "Input",
-            "DIR",
             "Folder with images of a uniform white surface: one for all lights, or one for each"
             " light.",
+            "DIR",
         ),
     ] = None
     white_level: WhiteLevel = None
@@ -264,20 +250,20 @@ class Reading(Record, frozen=True, kw_only=True):
         FileName | None,
         Option(
             "Lights",
-            "FILE|estimate",
             f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
             " estimate derives them from the images, less accurately than a calibration.",
-            default="the light file in CAPTURE",
+            "FILE|estimate",
+            "the light file in CAPTURE",
         ),
     ] = None
     first_light: Annotated[
         str | None,
         Option(
             "Lights",
-            "SIDE|DEGREES",
             "With --lights estimate: the side that the first light comes from, such as left, above"
             " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
             " images show no outline of the object.",
+            "SIDE|DEGREES",
             complete=tuple(SIDES_DEG),
         ),
     ] = None
@@ -285,10 +271,10 @@ class Reading(Record, frozen=True, kw_only=True):
         str | None,
         Option(
             "Lights",
-            "LIST",
             f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
             " before x).",
-            default="x right, y up, z to the camera",
+            "LIST",
+            "x right, y up, z to the camera",
             complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
         ),
     ] = None
@@ -296,7 +282,6 @@ class Reading(Record, frozen=True, kw_only=True):
         LightForm,
         Option(
             "Lights",
-            "",
             "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
             " slant-tilt, the angles of HALCON. Angles are in degrees.",
         ),
@@ -305,16 +290,15 @@ class Reading(Record, frozen=True, kw_only=True):
         FileName | None,
         Option(
             "Lights",
-            "FILE|equal",
             "Light intensities: a line r g b for each image.",
-            default="equal, or estimated if the images show that they differ",
+            "FILE|equal",
+            "equal, or estimated if the images show that they differ",
         ),
     ] = None
     lights_in_channels: Annotated[
         bool,
         Option(
             "Lights",
-            "",
             "The channels of each colour image are photographs under three coloured lamps; the"
             " light file has three lights for each image, in the order R, G, B. For gray objects.",
         ),
@@ -323,59 +307,58 @@ class Reading(Record, frozen=True, kw_only=True):
         FileName | None,
         Option(
             "Lights",
-            "FILE",
             "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
             " channels R, G, B.",
-            default="crosstalk.txt in CAPTURE, or none",
+            "FILE",
+            "crosstalk.txt in CAPTURE, or none",
         ),
     ] = None
     light_positions: Annotated[
         FileName | None,
         Option(
             "Lights",
-            "FILE",
             "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
-            default="light_positions.txt in CAPTURE",
+            "FILE",
+            "light_positions.txt in CAPTURE",
         ),
     ] = None
     light_distance: Annotated[
         Positive | None,
         Option(
-            "Lights", "D", "Near lamps: the distance of all lamps from the middle of the object."
+            "Lights", "Near lamps: the distance of all lamps from the middle of the object.", "D"
         ),
     ] = None
     pixel_size: Annotated[
         Positive | None,
         Option(
             "Lights",
-            "S",
             "Near lamps: the width of a pixel on the object.",
-            default="pixel_size.txt in CAPTURE",
+            "S",
+            "pixel_size.txt in CAPTURE",
         ),
     ] = None
     object_width: Annotated[
         Positive | None,
         Option(
             "Lights",
-            "W",
             "Near lamps: the width of the object in its mask, instead of --pixel-size.",
+            "W",
         ),
     ] = None
     camera_matrix: Annotated[
         FileName | None,
         Option(
             "Lights",
-            "FILE",
             "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
             " is then estimated in the frame of its viewing ray.",
-            default="camera_matrix.txt in CAPTURE, or orthographic",
+            "FILE",
+            "camera_matrix.txt in CAPTURE, or orthographic",
         ),
     ] = None
     strict: Annotated[
         bool,
         Option(
             "Output",
-            "",
             "Fail with exit code 3 if the lights or the images are probably wrong, instead of"
             " warning.",
         ),
@@ -383,38 +366,32 @@ class Reading(Record, frozen=True, kw_only=True):
     # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
     surface = False
 
+    CONFLICTS: ClassVar[records.Conflicts] = (("lights_in_channels", "align", LEAVE_ONE),)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        # These options apply to a light file or to near lamps.
-        reasons = {
-            "--light-positions": self.light_positions is not None and "finds distant lights",
-            "--light-distance": self.light_distance is not None and "finds distant lights",
-            "--light-frame": self.light_frame is not None and "needs no light file",
-            "--light-format": self.light_format != "xyz" and "needs no light file",
-        }
-        for option, reason in reasons.items():
-            if self.finds_lights and reason:
+        # These options apply to near lamps or to a light file.
+        near, of_file = "finds distant lights", "needs no light file"
+        for option, given, reason in (
+            ("--light-positions", self.light_positions is not None, near),
+            ("--light-distance", self.light_distance is not None, near),
+            ("--light-frame", self.light_frame is not None, of_file),
+            ("--light-format", self.light_format != "xyz", of_file),
+        ):
+            if self.finds_lights and given:
                 problem = f"--lights estimate {reason}, so it contradicts {option}"
                 raise UsageError(problem, hint=f"Leave {option} out, or give a light file")
+        add_it = "Add it, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
-            raise UsageError(
-                "--crosstalk needs --lights-in-channels", hint="Add it, or leave both out"
-            )
+            raise UsageError("--crosstalk needs --lights-in-channels", hint=add_it)
         if self.align and self.scale is not None:
             problem = "--align needs every row and column, so it contradicts --scale"
             raise UsageError(problem, hint="Leave one out, or use --crop for a first look")
-        if self.lights_in_channels and self.align:
-            raise UsageError(
-                "--lights-in-channels and --align contradict each other", hint="Leave one out"
-            )
-        if self.first_light is not None and not self.finds_lights:
-            raise UsageError(
-                "--first-light needs --lights estimate", hint="Add it, or leave both out"
-            )
         if self.first_light is not None:
+            if not self.finds_lights:
+                raise UsageError("--first-light needs --lights estimate", hint=add_it)
             azimuth_of(self.first_light)
-        _ = self.lamps, parse_window(self.crop, self.scale)
-        parse_transfer(self.transfer)
+        _ = self.lamps, parse_window(self.crop, self.scale), parse_transfer(self.transfer)
         if "exchanged" in (self.light_frame or ""):  # its name in earlier versions
             raise UsageError(f"--light-frame is {self.light_frame!r}; exchanged is now {EXCHANGED}")
         parse_light_frame(self.light_frame)
@@ -446,15 +423,10 @@ class Reading(Record, frozen=True, kw_only=True):
         no images.
         """
         intensities = None if self.intensities == EQUAL else self.intensities
-        named = (
-            self.light_file,
-            self.light_positions,
-            intensities,
-            self.camera_matrix,
-            self.mask,
-            self.crosstalk,
-        )
-        for name in (*named, self.ground_truth, self.ambient):
+        for name in (
+            *(self.light_file, self.light_positions, intensities, self.camera_matrix),
+            *(self.mask, self.crosstalk, self.ground_truth, self.ambient),
+        ):
             if name is not None:
                 check_file(Path(name), "a file", pipe=name == self.light_file)
         self.radiometric_calibration()
@@ -467,9 +439,8 @@ class Reading(Record, frozen=True, kw_only=True):
             flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
             check_not_empty(flats, folder)
         dark = None if self.ambient is None else Path(self.ambient)
-        return RadiometricCalibration(
-            parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC
-        )
+        automatic = self.transfer == AUTOMATIC
+        return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, automatic)
 
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder with these options. Raises InputError."""
@@ -507,9 +478,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     auto_mask: Annotated[
         bool,
         Option(
-            "Input",
-            "",
-            "If there is no mask, find the object in the images and write found_mask.png.",
+            "Input", "If there is no mask, find the object in the images and write found_mask.png."
         ),
     ] = False
     as_stored: AsStored = False
@@ -518,23 +487,23 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         Positive | None,
         Option(
             "Lights",
-            "S",
             "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
             " --surface: in millimetres, for a surface in millimetres.",
-            default="pixel_size.txt in CAPTURE",
+            "S",
+            "pixel_size.txt in CAPTURE",
         ),
     ] = None
     n_lights: Annotated[
         Annotated[int, Meta(ge=MIN_LIGHTS)] | None,
-        Option("Lights", "K", "Use K lights drawn at random.", default="all"),
+        Option("Lights", "Use K lights drawn at random.", "K", "all"),
     ] = None
     seed: RandomSeed = 0
     light_indices: Annotated[
         tuple[int, ...] | None,
         Option(
             "Lights",
-            "I,J,...",
             "Use these lights, counted from 0. Plots and warnings count from 1.",
+            "I,J,...",
             parse=partial(parse_indices, option="--light-indices"),
         ),
     ] = None
@@ -542,8 +511,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         str,
         Option(
             "Method",
-            "METHOD",
             f"Method to use: {records.listed(method_names())}.",
+            "METHOD",
             complete=method_names(),
         ),
     ] = DEFAULT_METHOD
@@ -552,27 +521,26 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         bool | None,
         Option(
             "Speed",
-            "",
             "Approximate the network with a smaller one, trained on a sample of the capture's"
             " pixels, or use the method on every pixel.",
             default="--distil from 100,000 pixels, else --exact",
-            names=("--distil/--exact",),
+            names="--distil/--exact",
         ),
     ] = None
     device: DeviceName = "auto"
     precision: PrecisionName = "auto"
     output: Annotated[
-        FileName, Option("Output", "OUT", "Write results to OUT/<capture name>/.", names=OUTPUT)
+        FileName, Option("Output", "Write results to OUT/<capture name>/.", "OUT", names=OUTPUT)
     ] = "out"
     formats: Annotated[
         tuple[str, ...],
         Option(
             "Output",
-            "LIST",
             f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
             " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
             " written as EXR, too.",
-            names=("--format",),
+            "LIST",
+            names="--format",
             items=NORMALS,
         ),
     ] = ("png", "npy")
@@ -580,50 +548,46 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         tuple[str, ...],
         Option(
             "Output",
-            "LIST",
             f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
             " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
             " curvature of 0.1 per pixel.",
+            "LIST",
             items=MAPS,
         ),
     ] = ()
     map_scales: tuple[tuple[str, Positive], ...] = ()
     html: Annotated[
-        bool,
-        Option("Output", "", "Also write page.html for interactive relighting, with all maps."),
+        bool, Option("Output", "Also write page.html for interactive relighting, with all maps.")
     ] = False
     surface: Annotated[
         bool,
         Option(
             "Output",
-            "",
             "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
         ),
     ] = False
-    discontinuity: Annotated[NotNegative, Option("Output", "K", DISCONTINUITY_HELP)] = DISCONTINUITY
+    discontinuity: Annotated[NotNegative, Option("Output", DISCONTINUITY_HELP, "K")] = DISCONTINUITY
     convention: Annotated[
         Convention,
-        Option("Output", "", "Green channel of the PNG files: opengl is y up, directx is y down."),
+        Option("Output", "Green channel of the PNG files: opengl is y up, directx is y down."),
     ] = "opengl"
+
+    CONFLICTS = (
+        *Reading.CONFLICTS,
+        ("n_lights", "light_indices", LEAVE_ONE),
+        ("mask", "auto_mask", LEAVE_ONE),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n_lights is not None and self.light_indices is not None:
-            raise UsageError(
-                "--n-lights and --light-indices contradict each other", hint="Leave one out"
-            )
         count = self.n_lights if self.light_indices is None else len(self.light_indices)
         if self.align and count is not None and count < MIN_IMAGES:
             option = "--n-lights" if self.light_indices is None else "--light-indices"
             problem = f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}"
             raise UsageError(problem, hint="Use more lights, or leave --align out")
-        if self.mask is not None and self.auto_mask:
-            raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         if self.finds_lights and self.refine_lights:
-            raise UsageError(
-                "--lights estimate refines the lights that it finds",
-                hint="Leave --refine-lights out",
-            )
+            problem = "--lights estimate refines the lights that it finds"
+            raise UsageError(problem, hint="Leave --refine-lights out")
         check_method(self.method)
         if self.surface and self.pixel_size is not None:
             check_pixel_size(self.pixel_size)
@@ -635,19 +599,18 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         """See Record. --maps also sets scales, and the seed only applies if the lights are drawn at
         random.
         """
-        scales, names = [], []
-        scaled = [row.name for row in MAPS.values() if row.scale is not None]
-        for item in (given["maps"] or "").split(","):
-            name, colon, scale = (part.strip() for part in item.partition(":"))
-            names.append(name)
-            if colon:
-                if name not in scaled or not 0 < (to_number(scale) or 0) < math.inf:
-                    expected = " or ".join(f"{name}:NUMBER" for name in scaled)
-                    raise UsageError(
-                        f"--maps has {item.strip()!r}; a scale is given as {expected}, above 0"
-                    )
-                scales.append((name, float(scale)))
+        scales = []
         if given["maps"] is not None:
+            scaled = [row.name for row in MAPS.values() if row.scale is not None]
+            names = []
+            for item in given["maps"].split(","):
+                name, colon, scale = (part.strip() for part in item.partition(":"))
+                names.append(name)
+                if colon and (name not in scaled or not 0 < (to_number(scale) or 0) < math.inf):
+                    expected = " or ".join(f"{name}:NUMBER" for name in scaled)
+                    problem = f"--maps has {item.strip()!r}; a scale is given as {expected}"
+                    raise UsageError(f"{problem}, above 0")
+                scales += [(name, float(scale))] if colon else []
             given["maps"] = ",".join(names)
         if given["n_lights"] is None:
             given["seed"] = None
@@ -655,18 +618,12 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     def changes(self, earlier: InferOptions) -> list[str]:
         """Return the options that affect the results, which excludes --output and --device."""
-        kinds = records.field_types(type(self))
-        names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
-        options = {
-            name: records.option_of(kinds[name])
-            for name in names
-            if name not in ("output", "device")
-        }
-        return list(
-            dict.fromkeys(
-                records.long_name(name, of) if of else "--maps" for name, of in options.items()
-            )
-        )
+        found = {}
+        for name, kind in records.field_types(type(self)).items():
+            if name not in ("output", "device") and getattr(self, name) != getattr(earlier, name):
+                option = records.option_of(kind)
+                found[records.long_name(name, option) if option else "--maps"] = True
+        return list(found)
 
     @property
     def method_options(self) -> MethodOptions:
@@ -684,10 +641,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 def check_pixel_size(pixel_size: float) -> None:
     """Raise UsageError if a pixel size (mm) is out of range for a surface."""
     if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
-        raise UsageError(
-            f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to"
-            f" {LARGEST_PIXEL_MM:g}"
-        )
+        expected = f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
+        raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {expected}")
 
 
 def parse_indices(text: str, option: str) -> tuple[int, ...]:
@@ -728,19 +683,14 @@ class BatchOptions(Record, frozen=True, kw_only=True):
 
     captures: Annotated[
         tuple[Path, ...],
-        Option(
-            "Arguments",
-            "CAPTURE",
-            "Folders with the images of one object each, or films.",
-            repeated=True,
-        ),
+        Option("Arguments", "Folders with the images of one object each, or films.", "CAPTURE"),
     ]
     shard: Annotated[
         Shard | None,
         Option(
             "Processes and machines",
-            "I/N",
             "Process shard I of N: captures I, I+N, I+2N, ...",
+            "I/N",
             parse=Shard.parse,
         ),
     ] = None
@@ -750,28 +700,21 @@ class BatchOptions(Record, frozen=True, kw_only=True):
         bool,
         Option(
             "Output",
-            "",
             "Print a JSON list of the reports on stdout, and nothing else.",
-            names=("--json",),
+            names="--json",
         ),
     ] = False
     as_json_lines: Annotated[
         bool,
         Option(
             "Output",
-            "",
             "Print each report as one line of JSON on stdout as soon as its capture is done.",
-            names=("--jsonl",),
+            names="--jsonl",
         ),
     ] = False
     quiet: Quiet = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.as_json and self.as_json_lines:
-            raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
-        if self.overwrite and self.update:
-            raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
+    CONFLICTS = (("as_json", "as_json_lines", LEAVE_ONE), ("overwrite", "update", LEAVE_ONE))
 
     @property
     def redo(self) -> Redo:
@@ -785,29 +728,28 @@ class WatchOptions(Record, frozen=True, kw_only=True):
     folder: Annotated[
         Path,
         Option(
-            "Arguments", "FOLDER", "Folder in which captures arrive, each as a subfolder or a film."
+            "Arguments", "Folder in which captures arrive, each as a subfolder or a film.", "FOLDER"
         ),
     ]
     options: Annotated[
-        tuple[str, ...],
-        Option("Arguments", "-- OPTIONS", "Options of infer, after two dashes.", repeated=True),
+        tuple[str, ...], Option("Arguments", "Options of infer, after two dashes.", "-- OPTIONS")
     ] = ()
     marker: Annotated[
         str | None,
         Option(
             "Captures",
-            "NAME",
             "File that appears in a subfolder when it is complete.",
-            default="see --settle",
+            "NAME",
+            "see --settle",
         ),
     ] = None
     settle: Annotated[
         NotNegative,
         Option(
             "Captures",
-            "SECONDS",
             "A film, or a subfolder without --marker, is complete when it has not changed for this"
             " long.",
+            "SECONDS",
         ),
     ] = 5.0
 
@@ -816,16 +758,15 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     """The options of `info` in addition to Reading; see its help."""
 
     capture: Annotated[
-        Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")
+        Path, Option("Arguments", "Folder with the images of one object, or a film.", "CAPTURE")
     ]
     auto_mask: Annotated[
-        bool, Option("Input", "", "If there is no mask, find the object in the images.")
+        bool, Option("Input", "If there is no mask, find the object in the images.")
     ] = False
     check_lights: Annotated[
         bool,
         Option(
             "Lights",
-            "",
             "List other readings of the light file, and how well each of them fits the images.",
         ),
     ] = False
@@ -833,14 +774,14 @@ class InfoOptions(Display, frozen=True, kw_only=True):
         Path | None,
         Option(
             "Lights",
-            "FILE",
             "If the light directions fit the images better in another order or frame, write them"
             " in it.",
+            "FILE",
         ),
     ] = None
     plot: Annotated[
-        Path | None, Option("Output", "FILE", "Also plot the light directions to a PNG file.")
+        Path | None, Option("Output", "Also plot the light directions to a PNG file.", "FILE")
     ] = None
-    overwrite: Annotated[
-        bool, Option("Output", "", "Replace an earlier plot or file of lights.")
-    ] = False
+    overwrite: Annotated[bool, Option("Output", "Replace an earlier plot or file of lights.")] = (
+        False
+    )

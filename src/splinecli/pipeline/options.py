@@ -6,7 +6,7 @@ help.
 from __future__ import annotations
 
 from contextlib import suppress
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +27,7 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.pipeline import infer_options as shared
 from splinecli.pipeline.infer_options import (
     HERE,
+    LEAVE_ONE,
     MASK_IMAGE,
     OUTPUT,
     ClusterOptions,
@@ -56,62 +57,58 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
     """The options of `calibrate`."""
 
     balls: Annotated[
-        tuple[Path, ...],
-        Option("Arguments", "BALL", "Folders of images of one mirror ball each.", repeated=True),
+        tuple[Path, ...], Option("Arguments", "Folders of images of one mirror ball each.", "BALL")
     ]
     circles: Annotated[
         tuple[tuple[float, float, float], ...],
         Option(
             "Input",
-            "X,Y,R",
             "Outline of the ball in pixels, y down. May be repeated, once for each BALL.",
-            names=("--circle",),
+            "X,Y,R",
+            names="--circle",
             parse=parse_circle,
-            repeated=True,
         ),
     ] = ()
     masks: Annotated[
         tuple[Path, ...],
         Option(
             "Input",
-            "FILE",
             f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
-            names=("--mask",),
-            repeated=True,
+            "FILE",
+            names="--mask",
         ),
     ] = ()
     ball_diameter: Annotated[
         Positive | None,
         Option(
             "Input",
-            "D",
             "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the"
             " same unit.",
-            default="pixels",
+            "D",
+            "pixels",
         ),
     ] = None
     camera_matrix: Annotated[
         Path | None,
         Option(
             "Input",
-            "FILE",
             "Text file of the 3 x 3 camera matrix in pixels.",
-            default="focal length from EXIF, or a distant camera",
+            "FILE",
+            "focal length from EXIF, or a distant camera",
         ),
     ] = None
     gray_ball: Annotated[
         Path | None,
-        Option("Light intensities", "DIR", "Images of a matte gray ball under the same lights."),
+        Option("Light intensities", "Images of a matte gray ball under the same lights.", "DIR"),
     ] = None
     gray_card: Annotated[
         Path | None,
-        Option("Light intensities", "DIR", "Images of a matte gray card that faces the camera."),
+        Option("Light intensities", "Images of a matte gray card that faces the camera.", "DIR"),
     ] = None
     lights_in_channels: Annotated[
         bool,
         Option(
             "Light intensities",
-            "",
             "The images of the gray ball are colour images under three coloured lamps at once:"
             " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
             " order R, G, B.",
@@ -121,19 +118,21 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
         str,
         Option(
             "Light intensities",
-            "CURVE",
             "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
+            "CURVE",
             complete=shared.CURVES,
         ),
     ] = AUTOMATIC
     compare: Annotated[
         Path | None,
-        Option("Output", "FILE", "Compare the result with the light directions in a text file."),
+        Option("Output", "Compare the result with the light directions in a text file.", "FILE"),
     ] = None
-    output: Annotated[Path, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = Path(
+    output: Annotated[Path, Option("Output", "Folder of the results.", "OUT", names=OUTPUT)] = Path(
         "calibration"
     )
     overwrite: shared.Overwrite = False
+
+    CONFLICTS = (("gray_ball", "gray_card", LEAVE_ONE),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -141,20 +140,12 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
             hint = "Leave it out: the light directions do not depend on the curve"
             raise UsageError("--transfer needs --gray-ball or --gray-card", hint=hint)
         if self.ball_diameter is not None and len(self.balls) < 2:
-            hint = (
-                "Photograph a second ball, or the same ball at another place: one ball gives no"
-                " positions"
-            )
-            raise UsageError("--ball-diameter needs two balls or more", hint=hint)
+            hint = "Photograph a second ball, or the same ball at another place: one ball gives no"
+            raise UsageError("--ball-diameter needs two balls or more", hint=f"{hint} positions")
         if self.lights_in_channels and not self.gray_ball:
-            raise UsageError(
-                "--lights-in-channels needs --gray-ball",
-                hint="Photograph a matte gray or white ball",
-            )
-        if self.gray_ball and self.gray_card:
-            raise UsageError(
-                "--gray-ball and --gray-card contradict each other", hint="Leave one out"
-            )
+            hint = "Photograph a matte gray or white ball"
+            raise UsageError("--lights-in-channels needs --gray-ball", hint=hint)
+
         for option, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
@@ -168,16 +159,12 @@ def parse_level(text: str) -> tuple[tuple[int, int], ...]:
     """
     if text.strip() == "plane":
         return ()
-    try:
+    with suppress(ValueError):
         points = tuple((int(x), int(y)) for x, y in (point.split(",") for point in text.split()))
         if len(points) >= 3:
             return points
-    except ValueError:
-        pass
-    hint = "Put quotation marks around the points"
-    raise UsageError(
-        f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"', hint=hint
-    )
+    problem = f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"'
+    raise UsageError(problem, hint="Put quotation marks around the points")
 
 
 class IntegrateOptions(Display, frozen=True, kw_only=True):
@@ -187,49 +174,46 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         Path,
         Option(
             "Arguments",
-            "NORMALS",
             "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.",
+            "NORMALS",
         ),
     ]
     mask: Annotated[
         Path | None,
-        Option(
-            "Input", "FILE", MASK_IMAGE.format("object"), default="all pixels that have a normal"
-        ),
+        Option("Input", MASK_IMAGE.format("object"), "FILE", "all pixels that have a normal"),
     ] = None
     camera_matrix: Annotated[
         Path | None,
         Option(
             "Input",
-            "FILE",
             "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
-            default="as in report.json beside the normal map, or orthographic",
+            "FILE",
+            "as in report.json beside the normal map, or orthographic",
         ),
     ] = None
     pixel_size: Annotated[
         Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None,
         Option(
             "Input",
-            "MM",
             "Width of a pixel of the photographs on the object in millimetres, for a surface in"
             " millimetres.",
-            default="as given to infer --surface by report.json beside the normal map, or none",
+            "MM",
+            "as given to infer --surface by report.json beside the normal map, or none",
         ),
     ] = None
     pixel_aspect: Annotated[
         Annotated[float, Meta(ge=0.01, le=100)],
         Option(
             "Input",
-            "A",
             "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
             " images.",
+            "A",
         ),
     ] = 1.0
     convention: Annotated[
         Convention | None,
         Option(
             "Input",
-            "",
             "Green channel of a normal map of colours: opengl is y up, directx is y down.",
             default="as in report.json beside it, or opengl",
         ),
@@ -238,74 +222,72 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         Path | None,
         Option(
             "Input",
-            "FILE",
             "Image of the object's colours, for the mesh.",
-            default="albedo.png beside NORMALS, if NORMALS is a folder",
+            "FILE",
+            "albedo.png beside NORMALS, if NORMALS is a folder",
         ),
     ] = None
     prior: Annotated[
         Path | None,
         Option(
             "Input",
-            "FILE",
             "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
             " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
             " heights towards the camera in the unit of the result, or with depths in millimetres"
             " for a perspective camera. NaN is unknown.",
+            "FILE",
         ),
     ] = None
     discontinuity: Annotated[
         NotNegative | None,
         Option(
             "Method",
-            "K",
             shared.DISCONTINUITY_HELP,
-            default=f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
+            "K",
+            f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
         ),
     ] = None
     prior_detail: Annotated[
         Annotated[float, Meta(ge=1)] | None,
         Option(
             "Method",
-            "PIXELS",
             "With --prior: shapes narrower than this come from the normals.",
-            default="15 % of the object's size",
+            "PIXELS",
+            "15 % of the object's size",
         ),
     ] = None
     largest_step: Annotated[
         NotNegative | None,
         Option(
             "Method",
-            "PIXELS",
             "Leave out triangles whose corners differ by more than this height.",
-            default="keep all",
+            "PIXELS",
+            "keep all",
         ),
     ] = None
     level: Annotated[
         tuple[tuple[int, int], ...] | None,
         Option(
             "Method",
-            "plane|POINTS",
             "Level the surface, and write its normals: plane removes the slope of"
             " its dominant plane; three or"
             ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
+            "plane|POINTS",
             parse=parse_level,
         ),
     ] = None
     output: Annotated[
         Path | None,
-        Option(
-            "Output", "OUT", "Folder of the results.", default="the folder of NORMALS", names=OUTPUT
-        ),
+        Option("Output", "Folder of the results.", "OUT", "the folder of NORMALS", names=OUTPUT),
     ] = None
     formats: Annotated[
         tuple[str, ...],
         Option(
             "Output",
-            "LIST",
             f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
             " or as a 16-bit picture (png). exr needs the extra 'exr'.",
-            names=("--format",),
+            "LIST",
+            names="--format",
             items=SURFACE_FILES,
         ),
     ] = DEFAULT_FORMATS
@@ -313,10 +295,10 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         Count | None,
         Option(
             "Output",
-            "N",
             "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
             " (needs the extra 'mesh').",
-            default="all",
+            "N",
+            "all",
         ),
     ] = None
     overwrite: shared.Overwrite = False
@@ -377,24 +359,22 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         tuple[Path, ...],
         Option(
             "Arguments",
-            "DATASET",
             "Folders of captures with ground truth, or the captures themselves.",
-            repeated=True,
+            "DATASET",
         ),
     ]
     skip_first: Annotated[
         tuple[tuple[str, int], ...],
         Option(
             "Input",
-            "[CAPTURE=]N",
             "Leave out the first N images of one capture, or of all. May be repeated.",
-            default="0",
+            "[CAPTURE=]N",
+            "0",
             parse=parse_skip,
-            repeated=True,
         ),
     ] = ()
     max_pixels: Annotated[
-        Count | None, Option("Input", "N", "Score N random pixels of each capture.", default="all")
+        Count | None, Option("Input", "Score N random pixels of each capture.", "N", "all")
     ] = None
     as_stored: shared.AsStored = False
     white_level: shared.WhiteLevel = None
@@ -402,43 +382,41 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         str | None,
         Option(
             "Lights",
-            "estimate",
             "Estimate the lights of each draw from its images, and score them, too.",
-            default="the captures' light files",
+            "estimate",
+            "the captures' light files",
         ),
     ] = None
     n_lights: Annotated[
         tuple[int | None, ...],
         Option(
             "Lights",
-            "K|all",
             "Number of lights in each draw. May be repeated.",
-            default=str(DEFAULT_LIGHTS),
+            "K|all",
+            str(DEFAULT_LIGHTS),
             parse=parse_light_count,
-            repeated=True,
         ),
     ] = ()
     trials: Annotated[
         Count | None,
         Option(
             "Lights",
-            "T",
             "Number of random draws.",
-            default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
+            "T",
+            f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
         ),
     ] = None
     seed: shared.RandomSeed = 0
     draws: Annotated[
         FileName | None,
-        Option("Lights", "FILE", "Draws of lights: each line has light indices, counted from 0."),
+        Option("Lights", "Draws of lights: each line has light indices, counted from 0.", "FILE"),
     ] = None
     light_noise_deg: Annotated[
         tuple[NotNegative, ...],
         Option(
             "Lights",
-            "SIGMA",
             "Tilt the lights at random, with this standard deviation in degrees. May be repeated.",
-            repeated=True,
+            "SIGMA",
         ),
     ] = (0.0,)
     refine_lights: shared.RefineLights = False
@@ -446,20 +424,19 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         float | None,
         Option(
             "Lights",
-            "SIGMA",
             "With --refine-lights: usual error of the directions in degrees.",
-            default="5",
+            "SIGMA",
+            "5",
         ),
     ] = None
     methods: Annotated[
         tuple[str, ...],
         Option(
             "Method",
-            "M",
             f"Method to score: all, {listed(method_names())}. May be repeated.",
-            names=("--method",),
+            "M",
+            names="--method",
             complete=(*method_names(), "all"),
-            repeated=True,
         ),
     ] = (DEFAULT_METHOD,)
     weights: shared.Weights = None
@@ -467,57 +444,54 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         Count | None,
         Option(
             "Method",
-            "R",
             "Average the network's result over R views of each pixel: its lights rotated, for"
             " spline-net also mirrored.",
-            default="1; cnn-ps: 10",
+            "R",
+            "1; cnn-ps: 10",
         ),
     ] = None
     device: shared.DeviceName = "auto"
     precision: shared.PrecisionName = "auto"
     jobs: Annotated[
         Count | None,
-        Option("Speed", "N", "Number of trials at a time.", default="number of cores; 1 on a GPU"),
+        Option("Speed", "Number of trials at a time.", "N", "number of cores; 1 on a GPU"),
     ] = None
     cluster: ClusterOptions = HERE
     figures: Annotated[
-        bool, Option("Output", "", "Draw every method's maps for the first draw of each capture.")
+        bool, Option("Output", "Draw every method's maps for the first draw of each capture.")
     ] = False
     pixels: Annotated[
         tuple[tuple[int, int], ...],
         Option(
             "Output",
-            "ROW,COLUMN",
             "With --figures: show the observation maps of this pixel. May be repeated.",
-            names=("--pixel",),
+            "ROW,COLUMN",
+            names="--pixel",
             parse=parse_pixel,
-            repeated=True,
         ),
     ] = ()
     relight: Annotated[
         bool,
         Option(
             "Output",
-            "",
             "Estimate normals and material from the first draw of each capture, render the capture"
             " under its other lights, and compare with the photographs.",
         ),
     ] = False
-    output: Annotated[FileName, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = (
+    output: Annotated[FileName, Option("Output", "Folder of the results.", "OUT", names=OUTPUT)] = (
         "evaluation"
     )
     overwrite: Annotated[
-        bool, Option("Output", "", "Compute all trials again, also those stored in OUT.")
+        bool, Option("Output", "Compute all trials again, also those stored in OUT.")
     ] = False
+
+    CONFLICTS = (
+        ("draws", "n_lights", "Leave --n-lights out: the draws determine the number of lights"),
+        ("draws", "trials", "Leave --trials out: each line of the draws is a trial"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.draws is not None and self.n_lights:
-            hint = "Leave --n-lights out: the draws determine the number of lights"
-            raise UsageError("--draws and --n-lights contradict each other", hint=hint)
-        if self.draws is not None and self.trials is not None:
-            hint = "Leave --trials out: each line of the draws is a trial"
-            raise UsageError("--draws and --trials contradict each other", hint=hint)
         from splinecli.lights.light_fit import check_light_error
 
         check_light_error(self.light_error_deg, refines=self.refine_lights)
@@ -525,19 +499,15 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
             hint = "Without it, the light files of the captures are used"
             raise UsageError(f"--lights is {self.lights}; expected {ESTIMATE}", hint=hint)
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
-            problem = (
-                "--lights estimate uses no light file, so it contradicts --refine-lights and"
-                " --light-noise-deg"
-            )
-            raise UsageError(problem, hint="Leave these out")
+            problem = "--lights estimate uses no light file, so it contradicts --refine-lights and"
+            raise UsageError(f"{problem} --light-noise-deg", hint="Leave these out")
         if self.cluster != HERE and self.jobs is not None:
             hint = "Leave it out: a worker scores one trial at a time"
             raise UsageError("--jobs contradicts --workers and --cluster", hint=hint)
         for name in self.names:
             check_method(name)
-        if self.pixels and not (
-            self.figures and any(METHODS[name].observation_maps for name in self.names)
-        ):
+        with_maps = self.figures and any(METHODS[name].observation_maps for name in self.names)
+        if self.pixels and not with_maps:
             problem = "--pixel chooses the observation maps that --figures shows"
             raise UsageError(problem, hint="Add --figures and --method spline-net")
         _ = self.protocols
@@ -545,18 +515,14 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     @property
     def names(self) -> list[str]:
         """The names of the methods, without duplicates."""
-        return list(
-            dict.fromkeys(
-                n for name in self.methods for n in (method_names() if name == "all" else [name])
-            )
-        )
+        chosen = (method_names() if name == "all" else [name] for name in self.methods)
+        return list(dict.fromkeys(chain.from_iterable(chosen)))
 
     @property
     def method_options(self) -> MethodOptions:
         """The options for the methods."""
-        return MethodOptions(
-            self.weights, self.rotations, device=self.device, precision=self.precision
-        )
+        device, precision = self.device, self.precision
+        return MethodOptions(self.weights, self.rotations, device=device, precision=precision)
 
     @property
     def protocols(self) -> list[Protocol]:

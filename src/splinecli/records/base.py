@@ -7,6 +7,7 @@ follow from it.
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -14,29 +15,29 @@ from dataclasses import dataclass, is_dataclass
 from functools import lru_cache
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from msgspec import Meta, Struct, ValidationError, convert, to_builtins
-from msgspec.structs import replace
+from msgspec.structs import fields, replace
 
 from splinecli.errors import SplinecliError, UsageError, check_one_of
 
 ARGUMENTS = "Arguments"
 # The panels of the help, in order
-PANELS = (
-    *(
-        ARGUMENTS,
-        "Captures",
-        "Input",
-        "Settings",
-        "Pixels",
-        "Scenes",
-        "Length",
-        "Lights",
-        "Light intensities",
-    ),
-    *("Method", "Output", "Speed", "Processes and machines"),
-)
+PANELS = [
+    *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights"),
+    *("Light intensities", "Method", "Output", "Speed", "Processes and machines"),
+]
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
 Count = Annotated[int, Meta(ge=1)]
@@ -45,6 +46,7 @@ NotNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Conflicts = tuple[tuple[str, str, str], ...]
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 
@@ -53,20 +55,20 @@ class Option:
     """How a field is given on the command line: as `--field-name`, or by `names`.
 
     panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default:
-    text for a default of None in the help. complete: the values for shell completion, or a function
-    that returns them. parse: converts a text to the field's value, or each text if the option may
-    be `repeated`. items: the names allowed in a list "a,b".
+    text for a default of None in the help. names: such as "--output -o". complete: the values for
+    shell completion, or a function that returns them. items: the names allowed in a list "a,b";
+    any other field with a tuple is an option that may be repeated. parse: converts a text to the
+    field's value, or each text of a repeated option.
     """
 
     panel: str
-    metavar: str
     help: str
+    metavar: str = ""
     default: str | None = None
-    names: tuple[str, ...] = ()
+    names: str = ""
     complete: Callable[..., list[str]] | Collection[str] | None = None
     parse: Callable[[str], Any] | None = None
     items: Collection[str] = ()
-    repeated: bool = False
 
     @property
     def is_argument(self) -> bool:
@@ -84,27 +86,33 @@ class Option:
             if not names:
                 raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
             return names
-        if self.parse is None:
-            return tuple(given) if isinstance(given, list) else given
-        return tuple(map(self.parse, given)) if self.repeated else self.parse(given)
+        parse = self.parse or (lambda value: value)
+        return tuple(map(parse, given)) if isinstance(given, list) else parse(given)
 
 
 class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A frozen record of options, whose fields are validated. Raises UsageError for an invalid
-    value.
+    value, or for two options that cannot be used together.
     """
 
+    CONFLICTS: ClassVar[Conflicts] = ()
+    """Pairs of fields that cannot both differ from their defaults, each with a hint."""
+
     def __post_init__(self) -> None:
+        titles = {}
         for name, kind in field_types(type(self)).items():
             option, value = option_of(kind), getattr(self, name)
-            fit(
-                kind,
-                value,
-                f"option {name!r}" if option is None else long_name(name, option),
-                UsageError,
-            )
-            for item in value if option is not None and option.items else ():
-                check_one_of(name.removesuffix("s"), item, option.items)  # type: ignore[union-attr]
+            title = f"option {name!r}" if option is None else long_name(name, option)
+            fit(kind, value, title, UsageError)
+            if option is not None:
+                for item in value if option.items else ():
+                    check_one_of(name.removesuffix("s"), item, option.items)
+                titles[name] = title
+        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
+        for first, second, hint in self.CONFLICTS:
+            if first in given and second in given:
+                problem = f"{titles[first]} and {titles[second]} contradict each other"
+                raise UsageError(problem, hint=hint)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with new values for some fields."""
@@ -132,32 +140,29 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         values: dict[str, Any] = {}
         for name, kind in field_types(cls).items():
-            option = option_of(kind)
-            if option is None and isinstance(kind, type) and issubclass(kind, Record):
+            if (option := option_of(kind)) is not None:
+                if (value := given.pop(name)) is not None:
+                    values[name] = _converted(kind, option, value, long_name(name, option))
+                elif option.is_argument:
+                    values[name] = ()
+            elif isinstance(kind, type) and issubclass(kind, Record):
                 values[name] = kind.from_arguments(given)
-            elif option is not None and (value := given.pop(name)) is not None:
-                title = long_name(name, option)
-                value = option.value_of(value, title)
-                if (number := number_of(kind)) is not None and option.parse is None:
-                    one: Any = Annotated[number, limits(kind)]
-                    items = [
-                        fit(one, item, title, UsageError, strict=False) for item in _each(value)
-                    ]
-                    value = tuple(items) if option.repeated else items[0]
-                is_name = PATH in _metadata(kind)
-                if (
-                    (is_name or isinstance(value, Path))
-                    and not option.is_argument
-                    and str(value).startswith("-")
-                ):
-                    raise UsageError(
-                        f"{title} needs a file or folder, found {value}",
-                        hint="Name it after the option",
-                    )
-                values[name] = str(value) if is_name else value
-            elif option is not None and option.is_argument and option.repeated:
-                values[name] = ()
         return cls(**values)
+
+
+def _converted(kind: Any, option: Option, given: Any, title: str) -> Any:
+    """Convert Typer's value to a value of the field's type. Raises UsageError."""
+    value = option.value_of(given, title)
+    if (number := number_of(kind)) is not None and option.parse is None:
+        one: Any = Annotated[number, limits(kind)]
+        items = [fit(one, item, title, UsageError, strict=False) for item in _each(value)]
+        value = tuple(items) if isinstance(value, tuple) else items[0]
+    is_name = PATH in _metadata(kind)
+    is_file = (is_name or isinstance(value, Path)) and not option.is_argument
+    if is_file and str(value).startswith("-"):
+        problem = f"{title} needs a file or folder, found {value}"
+        raise UsageError(problem, hint="Name it after the option")
+    return str(value) if is_name else value
 
 
 @lru_cache
@@ -205,16 +210,15 @@ def fit(
 
 def option_of(kind: Any) -> Option | None:
     """Return how a field of this annotation is given on the command line."""
-    return next(
-        (item for item in getattr(kind, "__metadata__", ()) if isinstance(item, Option)), None
-    )
+    metadata = getattr(kind, "__metadata__", ())
+    return next((item for item in metadata if isinstance(item, Option)), None)
 
 
 def long_name(name: str, option: Option) -> str:
     """Return the long name of an option, such as --n-lights, or the name of an argument."""
     if option.is_argument:
         return option.metavar
-    return option.names[0].split("/")[0] if option.names else f"--{name.replace('_', '-')}"
+    return re.split("[ /]", option.names)[0] or f"--{name.replace('_', '-')}"
 
 
 def limits(kind: Any) -> Meta:

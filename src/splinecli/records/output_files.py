@@ -29,13 +29,7 @@ REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
 # of the other commands
-PLOTS = (
-    "calibration.png",
-    "light_noise.png",
-    "contact_sheet.png",
-    "curves.png",
-    "maps.png",
-)
+PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
 # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 BYTES_OF_SURFACE = 600
@@ -54,10 +48,7 @@ SURFACE_FILES = {
 and a gloss.
 """
 # of `integrate --level`
-LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = (
-    "level_normals.npy",
-    "level_normals.png",
-)
+LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = ("level_normals.npy", "level_normals.png")
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 
 

@@ -20,54 +20,49 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     sources: Annotated[
         tuple[Path, ...],
         Option(
-            "Arguments",
-            "SOURCE",
-            "Captures with ground truth, folders of them, CyclesPS trees.",
-            repeated=True,
+            "Arguments", "Captures with ground truth, folders of them, CyclesPS trees.", "SOURCE"
         ),
     ] = ()
     as_stored: shared.AsStored = False
     white_level: shared.WhiteLevel = None
     update: shared.Update = False
-    scenes: Annotated[Natural, Option("Scenes", "N", "Render N random scenes.")] = 0
+    scenes: Annotated[Natural, Option("Scenes", "Render N random scenes.", "N")] = 0
     meshes: Annotated[
         tuple[Path, ...],
         Option(
             "Scenes",
-            "FILE",
             "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.",
-            names=("--mesh",),
-            repeated=True,
+            "FILE",
+            names="--mesh",
         ),
     ] = ()
     views: Annotated[
         Natural,
         Option(
             "Scenes",
-            "N",
             "Render each mesh N times, from random views. 0 renders it once, along its +z axis.",
+            "N",
         ),
     ] = 0
     reliefs: Annotated[
         tuple[Path, ...],
         Option(
             "Scenes",
-            "FILE",
             "Put this tileable normal map on half of the scenes. May be repeated.",
-            names=("--relief",),
-            repeated=True,
+            "FILE",
+            names="--relief",
         ),
     ] = ()
     size: Annotated[
         Annotated[int, Meta(ge=8)] | None,
-        Option("Scenes", "PIXELS", "Width and height of the rendered images.", default="128"),
+        Option("Scenes", "Width and height of the rendered images.", "PIXELS", "128"),
     ] = None
     n_lights: Annotated[
         Annotated[int, Meta(ge=16)] | None,
-        Option("Scenes", "N", "Number of lights of a rendered scene.", default="100"),
+        Option("Scenes", "Number of lights of a rendered scene.", "N", "100"),
     ] = None
-    seed: Annotated[Seed, Option("Scenes", "S", "Seed of the random draws.")] = 0
-    output: Annotated[Path, Option("Output", "SET", "Folder of the pixel set.", names=OUTPUT)]
+    seed: Annotated[Seed, Option("Scenes", "Seed of the random draws.", "S")] = 0
+    output: Annotated[Path, Option("Output", "Folder of the pixel set.", "SET", names=OUTPUT)]
     processes: Workers = Workers()
 
 
@@ -95,58 +90,51 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     """The options of `train`."""
 
     sets: Annotated[
-        tuple[Path, ...],
-        Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.", repeated=True),
+        tuple[Path, ...], Option("Arguments", "Pixel sets made by 'splinecli prepare'.", "SET")
     ] = ()
     preset: Annotated[
         str | None,
         Option(
             "Settings",
-            "NAME",
             f"Settings to begin with: {', '.join(training.PRESET_NAMES)}.",
-            default=training.DEFAULT_PRESET,
+            "NAME",
+            training.DEFAULT_PRESET,
             complete=training.PRESET_NAMES,
         ),
     ] = None
     config: Annotated[
-        Path | None, Option("Settings", "FILE", "Settings from a TOML file or a run's config.json.")
+        Path | None, Option("Settings", "Settings from a TOML file or a run's config.json.", "FILE")
     ] = None
     param: Annotated[
         tuple[str, ...],
         Option(
-            "Settings",
-            "NAME=VALUE",
-            "One setting, such as pixels.wall_share=0.3. May be repeated.",
-            repeated=True,
+            "Settings", "One setting, such as pixels.wall_share=0.3. May be repeated.", "NAME=VALUE"
         ),
     ] = ()
     start_from: Annotated[
         str | None,
         Option(
             "Settings",
-            "NAME|FILE",
             "Begin with these weights.",
-            default="random weights; preset refine: spline-net",
+            "NAME|FILE",
+            "random weights; preset refine: spline-net",
             complete=shared.complete_weights,
         ),
     ] = None
-    seed: Annotated[Seed | None, Option("Settings", "S", "Seed of the run.", default="0")] = None
+    seed: Annotated[Seed | None, Option("Settings", "Seed of the run.", "S", "0")] = None
     generator_weight: Annotated[
         NotNegative | None,
         Option(
-            "Pixels",
-            "W",
-            "Weight of generated pixels; each SET has weight 1.",
-            default="0; 1 without SET",
+            "Pixels", "Weight of generated pixels; each SET has weight 1.", "W", "0; 1 without SET"
         ),
     ] = None
     n_lights: Annotated[
         dict[str, int] | None,
         Option(
             "Pixels",
-            "K|MIN-MAX",
             "Number of lights of each pixel.",
-            default="the preset's",
+            "K|MIN-MAX",
+            "the preset's",
             parse=parse_light_counts,
         ),
     ] = None
@@ -154,56 +142,50 @@ class TrainOptions(Record, frozen=True, kw_only=True):
         Count | None,
         Option(
             "Length",
-            "N",
             "Train for N steps.",
-            default=f"{training.DEFAULT_STEPS:,}; presets paper: {training.PAPER_STEPS:,}, refine:"
+            "N",
+            f"{training.DEFAULT_STEPS:,}; presets paper: {training.PAPER_STEPS:,}, refine:"
             f" {training.REFINE_STEPS:,}",
         ),
     ] = None
     minutes: Annotated[
         Annotated[float, Meta(ge=0.01)] | None,
         Option(
-            "Length",
-            "M",
-            "Train for M minutes instead of a number of steps.",
-            default="train for --steps",
+            "Length", "Train for M minutes instead of a number of steps.", "M", "train for --steps"
         ),
     ] = None
-    resume: Annotated[bool, Option("Length", "", "Continue from the run's checkpoint.")] = False
+    resume: Annotated[bool, Option("Length", "Continue from the run's checkpoint.")] = False
     output: Annotated[
         Path,
         Option(
             "Output",
-            "RUN",
             f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS}"
             " seconds.",
+            "RUN",
             names=OUTPUT,
         ),
     ]
     tensorboard: Annotated[
-        bool, Option("Output", "", "Also write RUN/tensorboard (needs the extra 'tensorboard').")
+        bool, Option("Output", "Also write RUN/tensorboard (needs the extra 'tensorboard').")
     ] = False
     quiet: shared.Quiet = False
     device: shared.DeviceName = "auto"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.steps is not None and self.minutes is not None:
-            raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
+    CONFLICTS = (("steps", "minutes", shared.LEAVE_ONE),)
 
 
 class ImportOptions(Record, frozen=True, kw_only=True):
     """The options of `import-weights`."""
 
     li_net: Annotated[
-        Path, Option("Arguments", "G.ckpt", "The authors' LI-Net, which they call the generator.")
+        Path, Option("Arguments", "The authors' LI-Net, which they call the generator.", "G.ckpt")
     ]
     ne_net: Annotated[
         Path,
-        Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator."),
+        Option("Arguments", "The authors' NE-Net, which they call the discriminator.", "D.ckpt"),
     ]
     output: Annotated[
-        Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)
+        Path, Option("Output", "The weight file to write.", "FILE.safetensors", names=OUTPUT)
     ]
-    overwrite: Annotated[bool, Option("Output", "", "Replace an existing file.")] = False
+    overwrite: Annotated[bool, Option("Output", "Replace an existing file.")] = False
     quiet: shared.Quiet = False

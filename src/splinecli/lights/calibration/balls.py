@@ -40,13 +40,7 @@ DISTANT = 1e6
 # of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
 SHORTEST_LENS = 0.7
 # tags of EXIF
-_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (
-    0x920A,
-    0xA002,
-    0xA20E,
-    0xA210,
-    0xA405,
-)
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
 
 
 @dataclass(frozen=True, eq=False)
