@@ -39,7 +39,8 @@ from splinecli.records.output_files import (
 from splinecli.results.files import UnfinishedError, read_report
 from splinecli.surface import surface_files
 from splinecli.surface.bilateral_equations import DISCONTINUITY
-from splinecli.surface.make import make_surface
+from splinecli.surface.make import SurfaceSettings, make_surface
+from splinecli.surface.mesh import Textures
 from splinecli.surface.surface_files import encode_surface
 from splinecli.system.files import check_free, read_json
 from splinecli.system.machine import import_extra
@@ -92,9 +93,10 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
-    convention = options.convention or (
-        "opengl" if made_by is None else made_by["options"]["convention"]
-    )
+    used: Mapping[str, Any] = {"convention": "opengl", "discontinuity": DISCONTINUITY}
+    if made_by is not None:
+        used = made_by["options"]
+    convention = options.convention or used["convention"]
     normal_map = read_normal_map(path, options.mask, convention=convention)
     mask = np.asarray(normal_map.any(axis=2))
     n_pixels = int(np.count_nonzero(mask))
@@ -104,51 +106,27 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         options.normals,
         hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
     )
-    discontinuity = options.discontinuity
-    if discontinuity is None:
-        discontinuity = (
-            DISCONTINUITY if made_by is None else float(made_by["options"]["discontinuity"])
-        )
-    camera_matrix = (
-        None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
-    )
+    discontinuity, camera_matrix, prior = options.discontinuity, None, None
+    if options.camera_matrix is not None:
+        camera_matrix = read_camera_matrix(options.camera_matrix)
     pixel_size = options.pixel_size
     if made_by is not None:
         camera_matrix, pixel_size = view_of_report(made_by, camera_matrix, pixel_size)
-    prior = None
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
-    names = ("base_colour.png", GLOSS, "specular.npy")
-    of_material = [options.normals / MAPS["material"].files[name] for name in names]
-    has_material = all(path.is_file() for path in of_material)
-    picture, gloss, specular = options.colours, None, None
-    of_folder = of_material[0] if has_material else options.normals / MAPS["albedo"].files["png"]
-    if picture is None and of_folder.is_file():
-        picture = of_folder
-        if has_material:
-            gloss = _read_picture(of_material[1], mask.shape)
-            stored = read_depth(of_material[2], ExpectedSize(mask.shape, "the normal map", "a map"))
-            # up to full reflection
-            specular = np.nan_to_num(stored).clip(0, 12.5).astype(np.float32)
-    colours = None if picture is None else _read_picture(picture, mask.shape)
+    settings = SurfaceSettings(
+        float(used["discontinuity"]) if discontinuity is None else discontinuity,
+        pixel_size,
+        options.largest_step,
+        options.decimate,
+        prior,
+        options.prior_detail,
+        options.level,
+        options.pixel_aspect,
+    )
+    picture, textures = _read_textures(options, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
-        surface, found = make_surface(
-            normal_map,
-            mask,
-            camera_matrix,
-            colours,
-            gloss,
-            specular,
-            discontinuity=discontinuity,
-            largest_step=options.largest_step,
-            n_triangles=options.decimate,
-            pixel_size_mm=pixel_size,
-            prior=prior,
-            prior_detail=options.prior_detail,
-            level=options.level,
-            pixel_aspect=options.pixel_aspect,
-            progress=advance,
-        )
+        surface, found = make_surface(normal_map, mask, camera_matrix, textures, settings, advance)
     report = {
         "schema": 3,
         "normals": str(options.normals),
@@ -160,9 +138,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
     }
-    with new_files(
-        options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)
-    ) as new:
+    stale = _earlier_files(options.folder)
+    with new_files(options.folder, report=SURFACE_REPORT, stale=stale) as new:
         for name, content in encode_surface(surface, options.formats):
             new.write(name, content)
         if surface.level_normals is not None:
@@ -170,13 +147,37 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             new.write(LEVEL_PICTURE, encode_png(encode_picture(surface.level_normals, mask)))
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [
-            name for name in options.files if name in new.sizes or name == SURFACE_REPORT
-        ]
+        report["files"] = [name for name in options.files if name in {*new.sizes, SURFACE_REPORT}]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     if report["level"] is not None:
         observer.say(f"The surface was levelled by {report['level']['tilt_deg']:.2f} degrees")
     return report
+
+
+def _read_textures(
+    options: IntegrateOptions, shape: tuple[int, ...]
+) -> tuple[Path | None, Textures]:
+    """Return the image of the colours, if there is one, and the textures (H, W): of the colours
+    that are given, or of the maps in the folder.
+    """
+    folder, picture = options.normals, options.colours
+    material = MAPS["material"].files
+    base, gloss, specular = (
+        folder / material[name] for name in ("base_colour.png", GLOSS, "specular.npy")
+    )
+    has_material = all(path.is_file() for path in (base, gloss, specular))
+    of_folder = base if has_material else folder / MAPS["albedo"].files["png"]
+    if picture is None and of_folder.is_file():
+        picture = of_folder
+    if picture is None:
+        return None, Textures()
+    colours = _read_picture(picture, shape)
+    if options.colours is not None or not has_material:
+        return picture, Textures(colours)
+    stored = np.nan_to_num(read_depth(specular, ExpectedSize(shape, "the normal map", "a map")))
+    # up to full reflection
+    reflection = stored.clip(0, 12.5).astype(np.float32)
+    return picture, Textures(colours, _read_picture(gloss, shape), reflection)
 
 
 def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -189,14 +190,11 @@ def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     """Return a one-line summary of the files that were written."""
-    unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[
-        report["unit"]
-    ]
+    units = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}
     low, high = report["range"]
-    return (
-        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
-        f" {report['seconds']:.1f} s"
-    )
+    extent = f"from {low:.4g} to {high:.4g} {units[report['unit']]}"
+    pixels, seconds = report["n_pixels"], report["seconds"]
+    return f"{options.folder}: {pixels} pixels, {extent}, {seconds:.1f} s"
 
 
 class _Listing(Struct):
@@ -211,11 +209,9 @@ def _earlier_files(folder: Path) -> list[str]:
     """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files
-        return [
-            name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named
-        ]
     except (OSError, ValueError):
         return []
+    return [name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
 
 
 def _find_normal_map(folder: Path) -> Path:
@@ -229,9 +225,8 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no whole results of infer: it {error}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
-    raise InputError(
-        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
-    )
+    hint = "Give a folder that 'splinecli infer' wrote, or one of its files"
+    raise InputError(problem, path=folder, hint=hint)
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
@@ -248,14 +243,10 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
-        convention, discontinuity = (
-            report["options"]["convention"],
-            float(report["options"]["discontinuity"]),
-        )
-        if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
+        used = report["options"]
+        is_finite = 0 <= float(used["discontinuity"]) < math.inf
+        if is_finite and used["convention"] in get_args(Convention):
             return report
-    problem = (
-        "is damaged, or from another version: it does not say how the normal map beside it was made"
-    )
+    problem = "is damaged, or from another version: it does not say how the normal map beside it"
     hint = "Run 'splinecli infer' again, or move the normal map to another folder"
-    raise InputError(problem, path=path.parent / REPORT, hint=hint)
+    raise InputError(f"{problem} was made", path=path.parent / REPORT, hint=hint)

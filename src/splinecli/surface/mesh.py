@@ -59,11 +59,24 @@ class SurfaceMesh:
         return np.asarray(self.texture[rows.clip(0, height - 1), columns.clip(0, width - 1)])
 
 
+@dataclass(frozen=True)
+class Textures:
+    """Pictures for a mesh, each (H, W) or (H, W, 3); see the fields of SurfaceMesh."""
+
+    texture: NDArray[np.uint8] | None = None
+    gloss: NDArray[np.uint8] | None = None
+    specular: Float32Array | None = None
+
+    def put_on(self, mesh: SurfaceMesh, mask: Bools) -> SurfaceMesh:
+        """Return a mesh with these textures, which are known in the mask (H, W)."""
+        given = {name: picture for name, picture in vars(self).items() if picture is not None}
+        return replace(mesh, **{name: fill_outside(given[name], mask) for name in given})
+
+
 def surface_mesh(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None = None,
-    colours: NDArray[np.uint8] | None = None,
     *,
     normal_map: Floats | None = None,
     largest_step: float | None = None,
@@ -80,7 +93,6 @@ def surface_mesh(
             as integrate_normals returns them.
         mask: (H, W), True on the object.
         camera_matrix: (3, 3), the one that integrate_normals had, or None.
-        colours: (H, W, 3) uint8 sRGB, or None.
         normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them
             from the triangles.
         largest_step: leaves out triangles whose corners differ by more than this in height, in
@@ -89,11 +101,10 @@ def surface_mesh(
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
-    values = depth[mask].astype(np.float64)
+    heights = values = depth[mask].astype(np.float64)
     if camera_matrix is None:
         rows, columns = np.nonzero(mask)
-        heights = values
-        last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
+        last_row, last_column = np.array(mask.shape) - 1
         vertices = np.stack((columns - last_column / 2, last_row / 2 - rows, values), axis=1)
     else:
         vertices = values[:, None] * pixel_rays(mask, camera_matrix)
@@ -102,13 +113,8 @@ def surface_mesh(
     if largest_step is not None:
         triangles = triangles[np.ptp(heights[triangles], axis=1) <= largest_step]
     normals = vertex_normals(vertices, triangles) if normal_map is None else normal_map[mask]
-    return SurfaceMesh(
-        vertices.astype(np.float32),
-        triangles,
-        normals.astype(np.float32),
-        texture_coordinates(image_points(vertices, mask.shape, camera_matrix), mask.shape),
-        None if colours is None else fill_outside(colours, mask),
-    )
+    uvs = texture_coordinates(image_points(vertices, mask.shape, camera_matrix), mask.shape)
+    return SurfaceMesh(vertices.astype(np.float32), triangles, normals.astype(np.float32), uvs)
 
 
 def check_triangles(mask: Bools, path: Path) -> None:
@@ -172,15 +178,14 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).
-    squares = np.stack(
-        (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1
-    ).reshape(-1, 4)
+    corners = (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+    squares = np.stack(corners, axis=-1).reshape(-1, 4)
     inside = squares >= 0
     whole = squares[inside.all(axis=1)]
     step = np.abs(heights[whole[:, :2]] - heights[whole[:, 2:]])
     across = step[:, 0] <= step[:, 1]
-    corners = {True: ([0, 1, 2], [0, 2, 3]), False: ([0, 1, 3], [1, 2, 3])}
-    parts = [whole[across == way][:, three] for way, halves in corners.items() for three in halves]
+    halves = {True: ([0, 1, 2], [0, 2, 3]), False: ([0, 1, 3], [1, 2, 3])}
+    parts = [whole[across == way][:, three] for way, pair in halves.items() for three in pair]
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
@@ -196,7 +201,6 @@ def decimated_mesh(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None = None,
-    colours: NDArray[np.uint8] | None = None,
     *,
     n_triangles: int,
     normal_map: Floats,
@@ -210,7 +214,7 @@ def decimated_mesh(
     returned as it is.
 
     Args:
-        depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
+        depth, mask, camera_matrix, largest_step: see surface_mesh.
         n_triangles: at least 1.
         normal_map: (H, W, 3), unit on the object, zero outside.
 
@@ -218,12 +222,16 @@ def decimated_mesh(
         UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
-    mesh = _mesh_of_blocks(
-        depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step
-    )
-    if mesh is None:
+    # Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
+    # are requested, a mesh of blocks with at least four times the requested number has the same
+    # shape, and the normal texture keeps the detail.
+    mesh, n_pixels = None, np.count_nonzero(mask)
+    step = int((2 * n_pixels / (4 * n_triangles)) ** 0.5)
+    if step > 1 and n_pixels > LARGE_MAP:
+        mesh = _mesh_of_blocks(depth, mask, camera_matrix, step, normal_map, largest_step)
+    if mesh is None or len(mesh.triangles) <= n_triangles:
         mesh = surface_mesh(
-            depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step
+            depth, mask, camera_matrix, normal_map=normal_map, largest_step=largest_step
         )
     if n_triangles >= len(mesh.triangles):
         return mesh
@@ -234,20 +242,17 @@ def decimated_mesh(
         mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles
     )
     if not len(triangles):
-        raise InputError(
-            f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate"
-        )
+        problem = f"no mesh of {n_triangles} triangles is left"
+        raise InputError(problem, hint="Ask for more with --decimate")
     vertices = vertices * pixel
     normals = vertex_normals(vertices, triangles)
     tangents = _tangents(vertices, normals, camera_matrix)
-    shape = normal_map.shape[:2]
-    points = image_points(vertices, shape, camera_matrix)
-    return replace(
-        mesh,
-        vertices=vertices.astype(np.float32),
-        triangles=triangles.astype(np.int32),
-        normals=normals.astype(np.float32),
-        uvs=texture_coordinates(points, shape),
+    points = image_points(vertices, mask.shape, camera_matrix)
+    return SurfaceMesh(
+        vertices.astype(np.float32),
+        triangles.astype(np.int32),
+        normals.astype(np.float32),
+        texture_coordinates(points, mask.shape),
         tangents=tangents.astype(np.float32),
         normal_texture=_normal_texture(points, triangles, normals, tangents, normal_map),
     )
@@ -257,21 +262,11 @@ def _mesh_of_blocks(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None,
-    colours: NDArray[np.uint8] | None,
-    n_triangles: int,
+    step: int,
     normal_map: Floats,
     largest_step: float | None,
-) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None if its triangles would be too few, or
-    the map is small.
-
-    Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
-    are requested, a mesh of blocks with at least four times the requested number has the same
-    shape, and the normal texture keeps the detail.
-    """
-    step = int((2 * np.count_nonzero(mask) / (4 * n_triangles)) ** 0.5)
-    if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
-        return None
+) -> SurfaceMesh:
+    """Return the mesh of a map's blocks of step x step pixels, in the frame of the map."""
     blocks = Blocks.of_step(mask, step)
     of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
@@ -285,14 +280,11 @@ def _mesh_of_blocks(
         normal_map=unit(of_blocks[..., 1:]),
         largest_step=largest_step,
     )
-    if len(mesh.triangles) <= n_triangles:
-        return None
     shift = np.zeros(3)
     if camera_matrix is None:
         shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
     vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
-    texture = None if colours is None else fill_outside(colours, mask)
-    return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
+    return replace(mesh, vertices=vertices.astype(np.float32))
 
 
 def _tangents(
@@ -329,12 +321,8 @@ def _normal_texture(
     on_object = np.asarray(normal_map.any(axis=2))
     for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
         seen = on_object[rows, columns]
-        corners, weights, rows, columns = (
-            triangles[number[seen]],
-            weights[seen],
-            rows[seen],
-            columns[seen],
-        )
+        corners, weights = triangles[number[seen]], weights[seen]
+        rows, columns = rows[seen], columns[seen]
         frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
         texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
         texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
@@ -349,9 +337,8 @@ def _in_frame(
     perpendicular to N.
     """
     bitangents = np.cross(normals, tangents)
-    along, up, out = (
-        np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals)
-    )
+    axes = (tangents, bitangents, normals)
+    along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in axes)
     skew = np.einsum("qx,qx->q", tangents, normals)
     square = np.maximum(1 - skew**2, 1e-6)
     texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
@@ -376,19 +363,15 @@ def _covered_pixels(
         first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
         last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
         which, rows = _ranges(first, last)
-        slope, rest = (
-            forms[which, :, 0],
-            forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE,
-        )
+        slope, by_row, constant = np.moveaxis(forms[which], 2, 0)
+        rest = by_row * rows[:, None] + constant + _OUTSIDE
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -rest / slope
-        low = np.where(
-            slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)
-        ).max(axis=1)
+        elsewhere = np.where((slope == 0) & (rest < 0), np.inf, -np.inf)
+        low = np.where(slope > 0, crossing, elsewhere).max(axis=1)
         high = np.where(slope < 0, crossing, np.inf).min(axis=1)
-        span, columns = _ranges(
-            np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1)
-        )
+        first, last = np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1)
+        span, columns = _ranges(first, last)
         which, rows = which[span], rows[span]
         place = np.stack((columns, rows, np.ones(len(rows))), axis=1)
         yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
